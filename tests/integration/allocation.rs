@@ -5,8 +5,8 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use endless_gym::batch::zeroed;
-use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, NextOptions, PoolConfig, ResetRequest, Seeding};
+use endless_gym::{environments, memory_gym};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
@@ -44,7 +44,7 @@ fn steps_and_resets_allocate_nothing() {
     if !alone("allocation::steps_and_resets_allocate_nothing") {
         return;
     }
-    for spec in memory_gym().specs() {
+    for spec in environments().specs() {
         // Enough environments for two threads, and few enough for one.
         for (autoreset, num_envs, threads) in [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1)] {
             let config = PoolConfig {
@@ -54,18 +54,19 @@ fn steps_and_resets_allocate_nothing() {
                 features: true,
                 ..PoolConfig::new(spec.id, num_envs)
             };
-            let mut player = Player::with_threads(&config, threads);
+            let mut player = Player::in_registry(environments(), &config, threads);
             let mut other = zeroed(player.blocks.len());
             let mut random = SmallRng::seed_from_u64(1);
+            // In a Box, the bits of zeros.
             let branches = spec.action_space.branches();
-            let mut actions = vec![0; num_envs * branches.len()];
+            let mut actions = vec![0; num_envs * spec.action_space.width()];
             let mut play = |steps: usize| {
                 for step in 0..steps {
                     std::mem::swap(&mut player.blocks, &mut other);
                     if step % 500 == 0 {
                         player.reset(ResetRequest::All);
                     }
-                    for action in actions.chunks_exact_mut(branches.len()) {
+                    for action in actions.chunks_exact_mut(spec.action_space.width()) {
                         action.iter_mut().zip(branches).for_each(|(action, n)| *action = random.random_range(0..*n));
                     }
                     player.step(&actions);

@@ -83,7 +83,9 @@ fn description(spec: &EnvSpec) -> String {
     for parameter in spec.parameters {
         rows.add_row([parameter.name, &parameter.default_text(), &parameter.allowed(), parameter.description]);
     }
-    parts.push(format!("\n{rows}"));
+    if !spec.parameters.is_empty() {
+        parts.push(format!("\n{rows}"));
+    }
     let truth: Vec<_> = spec.ground_truth.iter().map(|column| [column.name, column.description]).collect();
     let info: Vec<_> = spec.info.iter().map(|column| [column.name, column.description]).collect();
     let features: Vec<_> = spec.features.iter().map(|column| [column.name, column.description]).collect();

@@ -29,8 +29,17 @@ impl Maze {
     /// Seeds the maze's generators.
     pub fn seed(&mut self, seed: u64) {
         // The original refuses seeds of more than 32 bits.
-        let numpy = MersenneTwister::from_numpy_seed(seed as u32);
-        self.random = Some((MersenneTwister::from_python_seed(seed), numpy));
+        let of_numpy = seed as u32;
+        match &mut self.random {
+            Some((python, numpy)) => {
+                python.seed_as_python(seed);
+                numpy.seed_as_numpy(of_numpy);
+            }
+            random => {
+                let python = MersenneTwister::from_python_seed(seed);
+                *random = Some((python, MersenneTwister::from_numpy_seed(of_numpy)));
+            }
+        }
     }
 
     /// Makes a maze of `cells` times `cells` cells. `random` seeds the maze's generators if nothing else has.

@@ -24,11 +24,26 @@ pub struct MersenneTwister {
 }
 
 impl MersenneTwister {
-    /// `random.seed(seed)` for an integer.
+    /// A new generator after `random.seed(seed)`.
     pub fn from_python_seed(seed: u64) -> Self {
+        let mut random = MersenneTwister { words: Vec::new(), used: WORDS };
+        random.seed_as_python(seed);
+        random
+    }
+
+    /// A new generator after `numpy.random.seed(seed)`.
+    pub fn from_numpy_seed(seed: u32) -> Self {
+        let mut random = MersenneTwister { words: Vec::new(), used: WORDS };
+        random.seed_as_numpy(seed);
+        random
+    }
+
+    /// `random.seed(seed)` for an integer. Keeps the memory of the state.
+    pub fn seed_as_python(&mut self, seed: u64) {
         let key = [seed as u32, (seed >> 32) as u32];
         let key = if key[1] == 0 { &key[..1] } else { &key[..] };
-        let mut words = initial(19_650_218);
+        self.seed_as_numpy(19_650_218);
+        let words = &mut self.words;
         let mixed = |words: &[u32], at: usize, factor: u32| {
             let last = words[at - 1];
             words[at] ^ (last ^ last >> 30).wrapping_mul(factor)
@@ -42,20 +57,24 @@ impl MersenneTwister {
             1
         };
         for number in (0..key.len()).cycle().take(WORDS) {
-            words[at] = mixed(&words, at, 1_664_525).wrapping_add(key[number]).wrapping_add(number as u32);
-            at = next(&mut words, at);
+            words[at] = mixed(words, at, 1_664_525).wrapping_add(key[number]).wrapping_add(number as u32);
+            at = next(words, at);
         }
         for _ in 1..WORDS {
-            words[at] = mixed(&words, at, 1_566_083_941).wrapping_sub(at as u32);
-            at = next(&mut words, at);
+            words[at] = mixed(words, at, 1_566_083_941).wrapping_sub(at as u32);
+            at = next(words, at);
         }
         words[0] = 1 << 31;
-        MersenneTwister { words, used: WORDS }
     }
 
-    /// `numpy.random.seed(seed)`.
-    pub fn from_numpy_seed(seed: u32) -> Self {
-        MersenneTwister { words: initial(seed), used: WORDS }
+    /// `numpy.random.seed(seed)`. Keeps the memory of the state.
+    pub fn seed_as_numpy(&mut self, seed: u32) {
+        let next = |&(at, word): &(u32, u32)| {
+            Some((at + 1, (word ^ word >> 30).wrapping_mul(1_812_433_253).wrapping_add(at + 1)))
+        };
+        self.words.clear();
+        self.words.extend(std::iter::successors(Some((0, seed)), next).map(|(_, word)| word).take(WORDS));
+        self.used = WORDS;
     }
 
     /// `random.randrange(count)`, and the index of `random.choice` among `count` items: a uniform number in `0..count`; 0 without a
@@ -110,12 +129,6 @@ impl MersenneTwister {
         }
         self.used = 0;
     }
-}
-
-fn initial(seed: u32) -> Vec<u32> {
-    let next =
-        |(at, word): &(u32, u32)| Some((at + 1, (word ^ word >> 30).wrapping_mul(1_812_433_253).wrapping_add(at + 1)));
-    std::iter::successors(Some((0, seed)), next).map(|(_, word)| word).take(WORDS).collect()
 }
 
 #[cfg(test)]
