@@ -106,11 +106,12 @@ def test_search_from_start_to_end(tmp_path: Path) -> None:
 def test_a_trial_that_diverges_fails_and_the_search_continues(tmp_path: Path) -> None:
     arguments = small(tmp_path, stage="single", parameters=("ppo.learning_rate",))
     trials = Trials(replace(arguments, settings=changed(arguments.settings, ppo={"learning_rate": 1e20})), QUIET)
-    search.run_trials(trials)
-    ended = {trial.params["ppo.learning_rate"]: trial.state.name for trial in trials.study.trials}
-    assert ended.pop(1e20) == "FAIL"
-    assert len(ended) == 4 and set(ended.values()) == {"COMPLETE"}
-    assert trials.remaining() == (4, 0)
+    for _ in range(2):
+        trial = trials.begin()
+        assert trial is not None
+        search.run_trial(trial, trial.settings)
+    ended = {trial.params["ppo.learning_rate"]: trial.state.name for trial in trials.study.trials if trial.params}
+    assert ended == {1e20: "FAIL", 2.75e-4: "COMPLETE"}
 
 
 def test_the_best_settings_are_replaced_atomically(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
