@@ -59,6 +59,11 @@ pub mod batch {
     pub use endless_gym_core::raster::PixelFormat;
 }
 
+/// Checks of environments, for the tests of those who write them.
+pub mod conformance {
+    pub use endless_gym_core::conformance::{Outcome, assert_conforms, check};
+}
+
 /// Environment ids: spaces, reset parameters, scripted experts.
 pub mod envs {
     pub use endless_gym_core::envs::{

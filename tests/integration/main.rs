@@ -3,6 +3,7 @@
 mod allocation;
 mod browser;
 mod checkpoints;
+mod conformance;
 mod drawing;
 mod examples;
 mod experts;

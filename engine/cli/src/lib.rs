@@ -1,6 +1,7 @@
 //! The command line program `endless`, as a library: the binary of the crate `endless-gym` and the Python package both run [`main`].
 
 mod bench;
+mod check;
 mod demo;
 mod engine_process;
 mod failure;
@@ -78,6 +79,8 @@ enum Command {
     Bench(bench::Args),
     /// Replay recorded traces of the original, and compare every observation, reward, flag and info.
     Verify(verify::Args),
+    /// Check environments with random actions: seeds, snapshots, frames, spaces, limits of reset parameters.
+    Check(check::Args),
     /// Write the raw frames of an expert's episode to standard output.
     #[command(hide = true)]
     Frames(frames::Args),
@@ -148,7 +151,7 @@ fn report(error: &(dyn std::error::Error + 'static)) -> u8 {
     }
 }
 
-/// Runs one command. Returns false if `verify` found a difference.
+/// Runs one command. Returns false if `verify` found a difference, or `check` a broken rule.
 fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
     logs::start(cli.log.as_deref())?;
     let Some(command) = cli.command else { return Ok(true) };
@@ -164,6 +167,7 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::Bench(args) => bench::run(registry, &args)?,
         Command::Frames(args) => frames::run(registry, &args)?,
         Command::Verify(args) => return verify::run(registry, &args),
+        Command::Check(args) => return check::run(registry, &args),
     }
     Ok(true)
 }

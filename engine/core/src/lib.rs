@@ -7,6 +7,7 @@
 #![deny(unsafe_code)]
 
 pub mod batch;
+pub mod conformance;
 pub mod envs;
 pub mod pool;
 pub mod random;

@@ -119,6 +119,10 @@ pub struct EnvSpec {
     pub features: &'static [Column],
     /// What the features stand for; `None` for a box without bounds.
     pub observation_space: Option<ObservationSpace>,
+    /// Whether an episode may show what earlier ones left, as in some originals. [`PoolConfig::independent_episodes`] prevents it.
+    ///
+    /// [`PoolConfig::independent_episodes`]: crate::pool::PoolConfig::independent_episodes
+    pub keeps_state: bool,
     /// Reset parameters with the original's names and defaults.
     pub parameters: &'static [Parameter],
     /// Frames per second for a human viewer.
@@ -140,6 +144,7 @@ impl EnvSpec {
             info: &[],
             features: &[],
             observation_space: None,
+            keeps_state: false,
             parameters: &[],
             render_fps: 25,
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
-use super::config::PoolConfig;
+use crate::batch::Frames;
 use crate::envs::{EnvSpec, Environment};
 use crate::raster::{Canvas, DirtySurface, FrameShape, PixelFormat};
 
@@ -28,9 +28,9 @@ pub(super) struct FrameFormat {
 
 impl FrameFormat {
     /// The frames of a pool. Without frames, they are empty.
-    pub fn new(spec: &EnvSpec, config: &PoolConfig) -> Self {
+    pub fn new(spec: &EnvSpec, frames: Option<Frames>) -> Self {
         let shape = spec.frame.unwrap_or(FrameShape::rgb(0, 0));
-        FrameFormat { shape, format: config.frames.unwrap_or_default().format }
+        FrameFormat { shape, format: frames.unwrap_or_default().format }
     }
 
     /// Bytes of a frame.

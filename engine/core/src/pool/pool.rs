@@ -70,7 +70,7 @@ impl Pool {
             layout,
             envs,
             buffers: Buffers::new(entropy.identity()),
-            frame: FrameFormat::new(&entry.spec, config),
+            frame: FrameFormat::new(&entry.spec, config.frames),
             check_drawing: config.check_drawing,
             autoreset: config.autoreset,
             threads: threads.clone(),

@@ -1,0 +1,371 @@
+//! Checks of an environment: whether it behaves as pools, engines and trainers rely on.
+//!
+//! ```
+//! use endless_gym_core::conformance;
+//! use endless_gym_memory_gym::memory_gym;
+//!
+//! let outcomes = conformance::check(memory_gym(), "MysteryPath-Grid-v0")?;
+//! assert!(outcomes.iter().all(|outcome| outcome.problem.is_none()));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use serde_json::{Map, Value as Json, json};
+
+use crate::batch::{Batch, Block, Frames, zeroed};
+use crate::envs::{ActionSpace, EnvSpec, ObservationSpace, Parameter, ParameterKind, Task, UnknownEnvironment};
+use crate::pool::{Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
+use crate::random::Generator;
+use crate::raster::PixelFormat;
+
+/// Environments of a pool.
+const NUM_ENVS: usize = 4;
+
+/// Steps of a check.
+const STEPS: usize = 400;
+
+/// A check and its outcome.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outcome {
+    /// What must be true.
+    pub rule: &'static str,
+    /// How the environment breaks it; `None` if it does not.
+    pub problem: Option<String>,
+}
+
+type Rule = fn(&Registry, &EnvSpec) -> Result<(), String>;
+
+const RULES: &[(&str, Rule)] = &[
+    ("the same seed and actions give the same bytes in every environment and for every number of threads", repeats),
+    ("another seed gives another episode", seeds_differ),
+    ("an episode does not depend on those before it", forgets),
+    ("an environment does not depend on its neighbours", is_alone),
+    ("a snapshot continues identically", snapshots_continue),
+    ("a changed frame equals one that is drawn in full", repaints),
+    ("rewards and observations are finite and within the declared spaces", numbers_are_declared),
+    ("every choice of every action can be played", actions_are_playable),
+    ("every reset parameter can be played at its limits", limits_are_playable),
+];
+
+/// Checks one id of a registry with random actions. A panic of the environment counts as a problem.
+///
+/// # Errors
+///
+/// [`UnknownEnvironment`] if the registry does not have the id.
+pub fn check(registry: &Registry, id: &str) -> Result<Vec<Outcome>, UnknownEnvironment> {
+    let spec = registry.spec(id)?;
+    let outcome = |(rule, test): &(&'static str, Rule)| {
+        let result = catch_unwind(AssertUnwindSafe(|| test(registry, spec)));
+        let problem = result.unwrap_or_else(|panic| Err(format!("it panicked: {}", message(&*panic)))).err();
+        Outcome { rule, problem }
+    };
+    Ok(RULES.iter().map(outcome).collect())
+}
+
+/// Checks all ids of a task, for a test in its crate.
+///
+/// # Panics
+///
+/// If an id breaks a rule, or if a specification contradicts itself.
+pub fn assert_conforms<T: Task>() {
+    let registry = Registry::new().with::<T>().unwrap_or_else(|error| panic!("{error}"));
+    for spec in registry.specs() {
+        let outcomes = check(&registry, spec.id).unwrap_or_default();
+        let problems =
+            outcomes.into_iter().filter_map(|Outcome { rule, problem }| Some(format!("{rule}: {}", problem?)));
+        let problems: Vec<_> = problems.collect();
+        assert!(problems.is_empty(), "{} breaks rules:\n{}", spec.id, problems.join("\n"));
+    }
+}
+
+fn message(panic: &(dyn std::any::Any + Send)) -> String {
+    let text = panic.downcast_ref::<String>().map(String::as_str).or_else(|| panic.downcast_ref::<&str>().copied());
+    text.unwrap_or("without a message").to_owned()
+}
+
+/// A pool with the memory for its batch and random actions.
+struct Game {
+    pool: Pool,
+    blocks: Vec<Block>,
+    random: Generator,
+}
+
+impl Game {
+    fn new(registry: &Registry, config: &PoolConfig, threads: usize) -> Result<Self, String> {
+        let threads = Threads::new(threads).map_err(text)?;
+        let pool = Pool::new(registry, config, &threads).map_err(text)?;
+        let blocks = zeroed(pool.layout().blocks());
+        Ok(Game { pool, blocks, random: Generator::from_seed(1) })
+    }
+
+    /// A game whose environments start with `seed`, `seed + 1` and so on.
+    fn started(registry: &Registry, config: &PoolConfig, seed: u64) -> Result<Self, String> {
+        let mut game = Game::new(registry, config, 1)?;
+        game.reset(seed)?;
+        Ok(game)
+    }
+
+    fn reset(&mut self, seed: u64) -> Result<(), String> {
+        self.pool.reset(ResetRequest::Seed(seed), &mut self.blocks).map_err(text)
+    }
+
+    fn batch(&self) -> Batch<'_> {
+        Batch::new(self.pool.layout(), &self.blocks)
+    }
+
+    /// Random actions for `num_envs` environments.
+    fn actions(&mut self, num_envs: usize) -> Vec<i32> {
+        let (space, random) = (&self.pool.spec().action_space, &mut self.random);
+        let action = |_| match space {
+            ActionSpace::Box { low, high } => low
+                .iter()
+                .zip(high.iter())
+                .map(|(low, high)| {
+                    let (low, high) = (low.max(-1e3), high.min(1e3));
+                    (low + random.random_f32() * (high - low)).to_bits().cast_signed()
+                })
+                .collect::<Vec<_>>(),
+            _ => space.branches().iter().map(|choices| random.integers(0, i64::from(*choices)) as i32).collect(),
+        };
+        (0..num_envs).flat_map(action).collect()
+    }
+
+    fn step(&mut self, actions: &[i32]) -> Result<(), String> {
+        self.pool.step(actions, &mut self.blocks).map_err(text)
+    }
+
+    /// Plays random actions and returns all batches.
+    fn play(&mut self, steps: usize) -> Result<Vec<Vec<u8>>, String> {
+        let mut played = vec![self.batch().bytes().to_vec()];
+        for _ in 0..steps {
+            let actions = self.actions(self.pool.layout().num_envs());
+            self.step(&actions)?;
+            played.push(self.batch().bytes().to_vec());
+        }
+        Ok(played)
+    }
+
+    /// One environment's part of the batch.
+    fn row(&self, env: usize) -> Vec<u8> {
+        let bytes = self.batch().bytes();
+        let sections = self.pool.layout().sections().iter();
+        let rows = sections.flat_map(|section| {
+            let length = section.bytes() / self.pool.layout().num_envs();
+            &bytes[section.offset() + env * length..][..length]
+        });
+        rows.copied().collect()
+    }
+}
+
+fn text(error: impl std::error::Error) -> String {
+    error.to_string()
+}
+
+/// All that an environment can write, with fixed seeds.
+fn config(spec: &EnvSpec, num_envs: usize) -> PoolConfig {
+    let seeding = Seeding::Continue { seed: Some(0) };
+    PoolConfig { features: !spec.features.is_empty(), seeding, ..PoolConfig::new(spec.id, num_envs) }
+}
+
+/// Fails at the first step after which two games differ.
+fn compare(one: &[Vec<u8>], other: &[Vec<u8>], what: &str) -> Result<(), String> {
+    match one.iter().zip(other).position(|(one, other)| one != other) {
+        None => Ok(()),
+        Some(0) => Err(format!("the first observation differs {what}")),
+        Some(step) => Err(format!("step {step} differs {what}")),
+    }
+}
+
+fn repeats(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let play = |threads| {
+        let mut game = Game::new(registry, &config(spec, 16 * NUM_ENVS), threads)?;
+        game.reset(3)?;
+        game.play(STEPS / 4)
+    };
+    let first = play(1)?;
+    compare(&first, &play(1)?, "in another pool")?;
+    compare(&first, &play(3)?, "with three threads")
+}
+
+fn seeds_differ(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let play = |seed| Game::started(registry, &config(spec, 1), seed)?.play(STEPS);
+    let first = play(0)?;
+    for seed in 1..8 {
+        if play(seed)? != first {
+            return Ok(());
+        }
+    }
+    Err(format!("the first {STEPS} steps are the same for 8 seeds"))
+}
+
+fn forgets(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    if spec.keeps_state {
+        return Ok(());
+    }
+    let expected = Game::started(registry, &config(spec, NUM_ENVS), 5)?.play(STEPS / 4)?;
+    let mut used = Game::started(registry, &config(spec, NUM_ENVS), 9)?;
+    used.play(STEPS)?;
+    used.reset(5)?;
+    used.random = Generator::from_seed(1);
+    compare(&expected, &used.play(STEPS / 4)?, "after other episodes; a family that keeps state must declare it")
+}
+
+fn is_alone(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let mut together = Game::started(registry, &config(spec, NUM_ENVS), 7)?;
+    let alone = (0..NUM_ENVS as u64).map(|env| Game::started(registry, &config(spec, 1), 7 + env));
+    let mut alone = alone.collect::<Result<Vec<_>, _>>()?;
+    let width = spec.action_space.width();
+    for step in 0..STEPS / 4 {
+        let actions = together.actions(NUM_ENVS);
+        together.step(&actions)?;
+        for (env, (game, action)) in alone.iter_mut().zip(actions.chunks_exact(width)).enumerate() {
+            game.step(action)?;
+            // Later episodes continue the environments' own seeds.
+            if game.batch().has_ended(0) {
+                return Ok(());
+            }
+            if game.row(0) != together.row(env) {
+                return Err(format!("environment {env} differs from one without neighbours after step {}", step + 1));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn snapshots_continue(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let mut game = Game::started(registry, &config(spec, 1), 11)?;
+    let mut other = Game::started(registry, &config(spec, 1), 500)?;
+    for start in [0, 1, 7, 40] {
+        game.reset(11 + start as u64)?;
+        game.play(start)?;
+        other.play(3)?;
+        other.pool.restore(0, &game.pool.snapshot(0).map_err(text)?).map_err(text)?;
+        for game in [&mut game, &mut other] {
+            game.pool.observe(&mut game.blocks).map_err(text)?;
+            game.random = Generator::from_seed(2);
+        }
+        let what = format!("after a restored snapshot of step {start}");
+        compare(&game.play(STEPS / 4)?, &other.play(STEPS / 4)?, &what)?;
+    }
+    Ok(())
+}
+
+fn repaints(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let Some(frame) = spec.frame else { return Ok(()) };
+    for (bits, stack) in [(0, 1), (1, 1), (2, 3), (4, 2)] {
+        let format = PixelFormat {
+            grayscale: bits == 4 && frame.channels == 3,
+            channels_first: bits == 1,
+            row_major: bits == 2,
+        };
+        let frames = Some(Frames { format, stack });
+        let config = PoolConfig { frames, check_drawing: true, ..config(spec, NUM_ENVS) };
+        Game::started(registry, &config, 13)?.play(STEPS)?;
+    }
+    Ok(())
+}
+
+fn numbers_are_declared(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let mut game = Game::started(registry, &config(spec, NUM_ENVS), 17)?;
+    for step in 0..=STEPS {
+        let batch = game.batch();
+        let at = |what: &str| format!("{what} after step {step}");
+        if let Some(reward) = batch.reward().iter().find(|reward| !reward.is_finite()) {
+            return Err(at(&format!("the reward is {reward}")));
+        }
+        for row in batch.features().chunks_exact(spec.features.len().max(1)) {
+            if let Some(number) = row.iter().position(|number| !number.is_finite()) {
+                return Err(at(&format!("the feature `{}` is {}", spec.features[number].name, row[number])));
+            }
+            if let Some(space) = spec.observation_space.filter(|space| !contains(space, row)) {
+                return Err(at(&format!("the features {row:?} are not in {space}")));
+            }
+        }
+        if let Some(number) = batch.ground_truth().iter().find(|number| !number.is_finite()) {
+            return Err(at(&format!("a number of the ground truth is {number}")));
+        }
+        for (env, row) in batch.info().chunks_exact(spec.info.len().max(1)).enumerate() {
+            let wrong = |(column, number): (&crate::envs::InfoColumn, &f64)| {
+                column.is_integer && batch.has_ended(env) && number.fract() != 0.0
+            };
+            if let Some(number) = spec.info.iter().zip(row).position(wrong) {
+                return Err(at(&format!(
+                    "the info `{}` is declared an integer, and is {}",
+                    spec.info[number].name, row[number]
+                )));
+            }
+        }
+        let actions = game.actions(NUM_ENVS);
+        game.step(&actions)?;
+    }
+    Ok(())
+}
+
+/// Whether features are in their space.
+fn contains(space: &ObservationSpace, row: &[f32]) -> bool {
+    let is_choice = |number: &f32, choices: &i32| number.fract() == 0.0 && (0.0..*choices as f32).contains(number);
+    match space {
+        ObservationSpace::Discrete(choices) => is_choice(&row[0], choices),
+        ObservationSpace::MultiDiscrete(choices) => {
+            row.iter().zip(*choices).all(|(number, choices)| is_choice(number, choices))
+        }
+        ObservationSpace::Box { low, high } => {
+            row.iter().zip(low.iter().zip(*high)).all(|(number, (low, high))| (*low..=*high).contains(number))
+        }
+        ObservationSpace::Tuple(parts) => {
+            let mut rest = row;
+            parts.iter().all(|part| {
+                let (own, others) = rest.split_at(part.width());
+                rest = others;
+                contains(part, own)
+            })
+        }
+    }
+}
+
+fn actions_are_playable(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let mut game = Game::started(registry, &config(spec, 1), 19)?;
+    let most = spec.action_space.branches().iter().copied().max().unwrap_or(0);
+    for repeated in 0..most {
+        let action: Vec<i32> = spec.action_space.branches().iter().map(|choices| repeated.min(choices - 1)).collect();
+        for _ in 0..STEPS / 4 {
+            game.step(&action)?;
+        }
+    }
+    if let ActionSpace::Box { low, high } = &spec.action_space {
+        for bounds in [low, high] {
+            let action: Vec<i32> = bounds.iter().map(|bound| bound.to_bits().cast_signed()).collect();
+            for _ in 0..STEPS / 4 {
+                game.step(&action)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn limits_are_playable(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    for parameter in spec.parameters {
+        for value in limits(parameter) {
+            let options: OptionMap = Map::from_iter([(parameter.name.to_owned(), value.clone())]);
+            let config = PoolConfig {
+                options: ResetOptions::Shared(options),
+                autoreset: Autoreset::SameStep,
+                ..config(spec, NUM_ENVS)
+            };
+            let play = || Game::started(registry, &config, 23)?.play(STEPS / 8);
+            let played = catch_unwind(AssertUnwindSafe(play)).unwrap_or_else(|panic| Err(message(&*panic)));
+            played.map_err(|error| format!("`{}` = {value}: {error}", parameter.name))?;
+        }
+    }
+    Ok(())
+}
+
+fn limits(parameter: &Parameter) -> Vec<Json> {
+    match parameter.kind {
+        ParameterKind::Bool { .. } => vec![json!(false), json!(true)],
+        ParameterKind::Int { min, max, .. } => vec![json!(min), json!(max)],
+        ParameterKind::Float { min, max, .. } => vec![json!(min), json!(max)],
+        ParameterKind::IntList { min, max, .. } => vec![json!([min]), json!([max]), json!([min, max])],
+    }
+}
