@@ -227,7 +227,9 @@ fn mypy(environment: &Path, package: &str) -> Result<(), String> {
 fn pytest(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &Path)]) -> Result<(), String> {
     // Not `python -m pytest`, which would import the package's folder instead of the installed package.
     let mut pytest = Command::new(environment.join("bin/pytest"));
-    pytest.args(["-q", "--timeout", "300", "--durations", "20", "-m", markers]);
+    pytest.args(["-q", "--timeout", "300", "--durations", "20", "-n", "logical", "--dist", "worksteal", "-m", markers]);
+    // There is a worker for each core already.
+    pytest.env("OMP_NUM_THREADS", "1");
     pytest.envs(pythons.iter().map(|(name, folder)| (name, folder.join("bin/python"))));
     run(pytest.current_dir(workspace().join(package)))
 }
