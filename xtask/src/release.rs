@@ -85,7 +85,7 @@ fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
     let mut maturin = maturin(tools, "build");
     maturin.current_dir(source).args(["--locked", "--zig", "--compatibility", PLATFORM]);
     maturin.arg("--target-dir").arg(target()?).arg("--out").arg(&built);
-    run(maturin.env("CARGO_ENCODED_RUSTFLAGS", remap()?))?;
+    run(maturin.env("CARGO_ENCODED_RUSTFLAGS", remap(source)?))?;
 
     // The bill of materials contains the paths of the local crates, so replace them. `wheel pack` updates the
     // checksums.
@@ -127,8 +127,7 @@ fn check_contents(wheel: &Path) -> Result<(), String> {
 /// Packages the crates, and builds each from its package with the packages of the others.
 fn crates(folder: &Path) -> Result<(), String> {
     let version = env!("CARGO_PKG_VERSION");
-    // In the target directory of the tests, which has compiled the dependencies.
-    let build = target()?;
+    let build = target()?.join("packaged");
     remove_earlier(&build)?;
     let mut package = cargo(&["package", "--locked", "--allow-dirty", "--target-dir"]);
     package.arg(&build).args(CRATES.map(|name| format!("--package={name}")));

@@ -4,7 +4,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::python;
-use crate::shell::{self, describe, output, remap, run, succeeds, target, workspace};
+use crate::shell::{self, describe, output, run, succeeds, target, workspace};
 
 /// A fixed seed of the property tests, so that a failure is due to a change.
 const PROPERTY_SEED: &str = "20251122";
@@ -146,12 +146,8 @@ fn count(id: &str) -> Result<u64, String> {
     // instruction.
     const TUNABLES: &str = "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000";
     let runner = format!("CARGO_TARGET_{}_RUNNER", env!("TARGET").to_uppercase().replace('-', "_"));
-    // With target and flags as for the wheel, which shares the compiled dependencies.
-    let target = ["bench", "--locked", "--target", env!("TARGET")];
-    let mut bench = shell::cargo(&target);
-    bench
-        .args(["--package", "endless-gym", "--bench", "instructions", "--", id])
-        .env("CARGO_ENCODED_RUSTFLAGS", remap()?);
+    let mut bench =
+        shell::cargo(&["bench", "--locked", "--package", "endless-gym", "--bench", "instructions", "--", id]);
     let printed = output(bench.env(runner, VALGRIND).env("GLIBC_TUNABLES", TUNABLES))?;
     let collected = printed.lines().find_map(|line| Some(line.split_once("Collected :")?.1.trim()));
     let count = collected.and_then(|count| count.parse().ok()).filter(|count| *count > 0);

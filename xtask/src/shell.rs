@@ -28,11 +28,10 @@ pub fn sysroot() -> Result<PathBuf, String> {
 }
 
 /// Compiler flags that replace paths of this machine in panic messages.
-pub fn remap() -> Result<OsString, String> {
+pub fn remap(source: &Path) -> Result<OsString, String> {
     let registry = cargo_home()?.join("registry/src");
     // If several match, the compiler applies the last.
-    let folders =
-        [(workspace().into(), "endless-gym"), (target()?, "target"), (registry, "registry"), (sysroot()?, "rust")];
+    let folders = [(target()?, "target"), (source.into(), "endless-gym"), (registry, "registry"), (sysroot()?, "rust")];
     let flags = folders.map(|(from, to)| {
         let mut flag = OsString::from("--remap-path-prefix=");
         flag.push(from);

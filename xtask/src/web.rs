@@ -47,7 +47,7 @@ impl Toolchain {
         let mut cargo = cargo(&["build", "--locked", "--release", "--target", TARGET]);
         cargo.args(arguments);
         // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
-        cargo.env("CARGO_ENCODED_RUSTFLAGS", remap()?);
+        cargo.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
         cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
         let mut built = target()?;
         if let Toolchain::Debian(folder) = self {
