@@ -31,7 +31,9 @@ def test_episodes_depend_only_on_the_seed_of_the_reset(seeds) -> None:
     played = []
     for where in WHERE:
         for seed in (0, 1):
-            with where(ID, NUM_ENVS, groups=GROUPS, seed=seed, seeds=seeds, options=OPTIONS, autoreset="same_step") as envs:
+            with where(
+                ID, NUM_ENVS, groups=GROUPS, seed=seed, seeds=seeds, options=OPTIONS, autoreset="same_step"
+            ) as envs:
                 every = [40 + env for env in range(GROUPS * NUM_ENVS)]
                 envs.reset()
                 for group in range(GROUPS):
