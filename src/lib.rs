@@ -1,12 +1,13 @@
-//! Endless Gym: the Memory Gym environments, bit-exact and at memory speed, in this process or in shared memory for any
-//! trainer on the host.
+//! Endless Gym: environments of Memory Gym and POPGym, bit-exact and at memory speed, in this process or in shared memory
+//! for any trainer on the host.
 //!
 //! This crate re-exports the public API of its member crates:
 //!
-//! - [`environments`]: the registry of all ids, those of [`memory_gym`] and [`popgym`]; [`envs`]: spaces, reset
-//!   parameters, scripted experts, and the trait [`Task`](envs::Task) for custom environments, which use [`raster`] to
-//!   draw and [`random`] for random numbers; [`pool`]: many environments in this process; [`batch`]: what a step returns; [`trace`]: replay of recorded
-//!   episodes. These are in `endless-gym-core`, which needs no operating system services and builds for WebAssembly.
+//! - [`environments`]: the registry of all ids, those of [`memory_gym`] and [`popgym`], which are crates of their own.
+//! - [`envs`]: spaces, reset parameters, scripted experts, and the trait [`Task`](envs::Task) for custom environments, which
+//!   draw frames with [`raster`] and random numbers with [`random`]; [`conformance`]: checks of such environments; [`pool`]:
+//!   many environments in this process; [`batch`]: what a step returns; [`trace`]: replay of recorded episodes. These are in
+//!   `endless-gym-core`, which needs no operating system services and builds for WebAssembly.
 //! - [`service`]: an engine, its trainer and observers, as processes that share memory. This is `endless-gym-service`.
 //!
 //! The program `endless` is `endless-gym-cli`; [`program`] runs it. Other exports of these crates (sprites and dirty
