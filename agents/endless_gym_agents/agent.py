@@ -36,9 +36,9 @@ from torch import Tensor, nn
 
 from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
-from endless_gym_agents import own
+from endless_gym_agents import own, wrappers
 from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
-from endless_gym_agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
+from endless_gym_agents.encoders import FRAME, Encoder, Observation, OwnEncoder, Shapes, orthogonal
 from endless_gym_agents.heads import Perceptron, PolicyHead, ReconstructionHead, ValueHead
 from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
 from endless_gym_agents.recurrent import CellMemory, RecurrentMemory
@@ -182,7 +182,11 @@ class Agent(nn.Module):
             self.transform = FrameStack(shapes, settings.model.stack, self.device)
         elif settings.agent == "position":
             self.transform = PositionalEncoding(shapes, self.device)
-        self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
+        if settings.encoder:
+            own_encoder = own.load("--encoder", settings.encoder, nn.Module)
+            self.encoder: Encoder = OwnEncoder(own_encoder, self.transform.shapes, settings.encoder_options())
+        else:
+            self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
         self.memory: AnyMemory
         if settings.agent == "gru" or settings.agent == "lstm":
             self.memory = RecurrentMemory(settings.agent, self.encoder.width, settings.recurrence, self.device)
@@ -191,7 +195,7 @@ class Agent(nn.Module):
             transformer = dataclasses.replace(settings.transformer, window=settings.window(), gating=gating)
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
         elif settings.is_own_agent:
-            cell, options = own.load("--agent", settings.agent), settings.agent_options()
+            cell, options = own.load("--agent", settings.agent, nn.Module), settings.agent_options()
             self.memory = CellMemory(cell, self.encoder.width, settings.recurrence, options, self.device)
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
@@ -445,6 +449,8 @@ def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu
     """
     observation = settings.environment.observation
     space = spec.observation_space(Frames() if observation == "rgb" else None, observation == "features")
+    if settings.environment.wrapper:
+        space = wrappers.observation_space(settings)
     if not isinstance(space, spaces.Dict):
         space = spaces.Dict({FRAME if observation == "rgb" else "features": space})
     shapes = {key: tuple(part.shape or ()) for key, part in space.items()}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -77,8 +77,13 @@ class Encoder(nn.Module):
         Args:
             shapes: Shapes of one environment's observation; the vectors are concatenated in this order.
             vector_width: Units of the fully connected layer.
+
+        Raises:
+            ValueError: The frames are not of 84 x 84 pixels.
         """
         super().__init__()
+        if FRAME in shapes and shapes[FRAME][:2] != (84, 84):
+            raise ValueError(f"frames must be of 84 x 84 pixels without an --encoder of your own, got {shapes[FRAME]}")
         self.vectors = [key for key in shapes if key != FRAME]
         self.frames = AtariEncoder(shapes[FRAME][-1]) if FRAME in shapes else None
         entries = sum(shapes[key][0] for key in self.vectors)
@@ -93,3 +98,47 @@ class Encoder(nn.Module):
         if self.vector is not None:
             parts.append(self.vector(torch.cat([observation[key] for key in self.vectors], dim=-1)))
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+
+
+class OwnEncoder(Encoder):
+    """An encoder of your own: a `torch.nn.Module` made by `Class(shapes, **options)`, with the options of `--encoder-option`.
+
+    Its `forward(observation)` encodes an observation of n environments as float (n, width). It must treat each environment's
+    observation by itself, since equal frames are encoded once.
+    """
+
+    def __init__(self, make: type[nn.Module], shapes: Shapes, options: dict[str, Any]) -> None:
+        """Make the encoder, and encode a blank observation to learn its width.
+
+        Args:
+            make: The class.
+            shapes: Shapes of one environment's observation.
+            options: Further arguments of the class.
+
+        Raises:
+            ValueError: The class does not take these arguments, or does not encode such an observation.
+        """
+        nn.Module.__init__(self)
+        self.vectors, self.frames, self.vector = [], None, None
+        try:
+            self.own = make(dict(shapes), **options)
+        except TypeError as error:
+            raise ValueError(f"{make.__name__} cannot be made of shapes and --encoder-option: {error}") from error
+        blank = {
+            key: torch.zeros((2, *shape), dtype=torch.uint8 if key == FRAME else torch.float32)
+            for key, shape in shapes.items()
+        }
+        try:
+            with torch.no_grad():
+                encoded = self.own.eval()(blank)
+        except (RuntimeError, ValueError, TypeError, KeyError) as error:
+            raise ValueError(f"{make.__name__} cannot encode an observation of {dict(shapes)}: {error}") from error
+        self.own.train()
+        if not isinstance(encoded, Tensor) or encoded.dim() != 2 or len(encoded) != 2:
+            got = tuple(encoded.shape) if isinstance(encoded, Tensor) else type(encoded).__name__
+            raise ValueError(f"{make.__name__} must encode n observations as a tensor (n, width), got {got} for n = 2")
+        self.width = encoded.shape[1]
+
+    def forward(self, observation: Observation) -> Tensor:
+        encoded: Tensor = self.own(observation)
+        return encoded

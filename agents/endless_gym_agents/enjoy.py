@@ -1,4 +1,4 @@
-"""`endless-enjoy`: record a video of a trained agent, with its observation next to the ground-truth view.
+"""`endless-enjoy`: record a video of a trained agent, with its frames next to the ground-truth view.
 
 ```console
 endless-enjoy runs/mine                                        # one episode, as a GIF
@@ -14,17 +14,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
 from rich.console import Console
 
-from endless_gym.create import make_vec
-from endless_gym.specs import ObservationName, spec
+from endless_gym.specs import spec
 from endless_gym.vector import EndlessVectorEnv
-from endless_gym_agents import checkpoint, command, video
+from endless_gym_agents import checkpoint, command, video, wrappers
 from endless_gym_agents.agent import Agent
-from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
 from endless_gym_agents.train import choose_device
 
@@ -73,24 +70,20 @@ class EpisodeRecorder:
 
     def frames(self, seeds: tuple[int, ...]) -> Iterator[video.Frame]:
         """Generate a frame for the start and for each step of the episodes with these seeds; the last frame lasts one second."""
-        settings = self.agent.settings
         generator = torch.Generator(self.agent.device).manual_seed(self.action_seed)
-        # The video shows rgb frames even if the agent observes features.
-        shown: ObservationName = "rgb" if settings.environment.observation == "rgb" else "rgb+features"
-        options = settings.options()
         for seed in seeds:
             # Like the original, an environment keeps some state between episodes; a new one gives the same video for a seed.
-            with make_vec(settings.env, 1, 1, options=options, autoreset="disabled", observation=shown) as envs:
+            with wrappers.make(self.agent.settings, 1, 1, autoreset="disabled", render_mode="rgb_array") as envs:
                 yield from self._episode(envs, seed, generator)
 
-    def _episode(self, envs: EndlessVectorEnv, seed: int, generator: torch.Generator) -> Iterator[video.Frame]:
+    def _episode(self, envs: Any, seed: int, generator: torch.Generator) -> Iterator[video.Frame]:
         settings, memory = self.agent.settings, self.agent.initial_memory(1)
         env_spec = spec(settings.env)
         observation, _ = envs.reset(seed=[seed])
         done = False
         self.rewards.append(0.0)
         self.lengths.append(0)
-        frame = self._frame(envs, observation, f"{settings.env}  seed {seed}  step 0")
+        frame = self._frame(envs.unwrapped, f"{settings.env}  seed {seed}  step 0")
         yield frame
         while not done and not (self.max_steps and self.lengths[-1] >= self.max_steps):
             action = self.agent.act(observation, memory, generator, self.greedy).action.cpu().numpy()
@@ -100,15 +93,16 @@ class EpisodeRecorder:
             self.lengths[-1] += 1
             text = f"{settings.env}  seed {seed}  step {self.lengths[-1]}  action {'-'.join(map(str, action[0]))}"
             text += f"  reward {self.rewards[-1]:.2f}"
-            frame = self._frame(envs, observation, text + ("  end" if done else ""))
+            frame = self._frame(envs.unwrapped, text + ("  end" if done else ""))
             yield frame
         for _ in range(env_spec.render_fps):
             yield frame
 
     @staticmethod
-    def _frame(envs: EndlessVectorEnv, observation: Any, text: str) -> video.Frame:
-        frame = observation[FRAME] if isinstance(observation, dict) else observation
-        return video.compose(np.asarray(frame)[0], envs.ground_truth_view(0), text)
+    def _frame(envs: EndlessVectorEnv, text: str) -> video.Frame:
+        # Drawn by the environment, since the agent may observe features, or what a wrapper makes of the frame.
+        (frame,) = envs.render() or ()
+        return video.compose(frame, envs.ground_truth_view(0), text)
 
 
 def execute(arguments: EnjoyArguments) -> None:

@@ -20,6 +20,7 @@ from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.recovery import RecoverableEngine
 from endless_gym_agents.settings import TRAINING_SEEDS, Settings
 from endless_gym_agents.view import ViewProcess
+from endless_gym_agents.wrappers import WrappedGroups
 
 
 @dataclass
@@ -28,7 +29,7 @@ class StepResult:
 
     Attributes:
         observation: Observation after the step; where an episode has ended, the first one of the next episode.
-        reward: float64 (n,).
+        reward: float64 (n,), that of the wrappers, if there are any.
         done: Whether the episode has ended, bool (n,).
         ground_truth: Ground truth of the observation, float64 (n, entries); None if the environment has none.
         episodes: Final infos of the episodes that have ended, one dict each.
@@ -111,9 +112,16 @@ class Environments:
         try:
             if not in_process:
                 self._engine = RecoverableEngine(settings.on_engine_failure, start, make)
-            self._envs: EndlessVectorEnv | RecoverableEngine = self._engine or make()
+            self._envs: EndlessVectorEnv | RecoverableEngine | WrappedGroups = self._engine or make()
         except RuntimeError as error:  # The engine reports why it cannot start.
             raise ValueError(str(error)) from error
+        self._wrapped: WrappedGroups | None = None
+        if wanted.wrapper:
+            try:
+                self._envs = self._wrapped = WrappedGroups(settings, self._envs)
+            except BaseException:
+                self.close()
+                raise
 
     def reset(self, group: int) -> StepResult:
         """Start an episode in every environment of a group."""
@@ -143,7 +151,11 @@ class Environments:
 
         Args:
             report: Called with a line of text for each failure from now on.
+
+        Raises:
+            ValueError: A wrapper has changed, and has no `state_dict`.
         """
+        self.wrapper_states()
         if self._engine is not None:
             self._engine.report = report
             self._engine.mark()
@@ -160,6 +172,19 @@ class Environments:
     def restore(self, snapshots: list[list[bytes]]) -> list[StepResult]:
         """Restore snapshots, and return the current observations of each group."""
         return [self._start(*self._envs.restore(dict(enumerate(each)), group)) for group, each in enumerate(snapshots)]
+
+    def wrapper_states(self) -> list[dict[str, Any]] | None:
+        """The states of the wrappers of each group, for a checkpoint; None without wrappers.
+
+        Raises:
+            ValueError: As for `mark`.
+        """
+        return None if self._wrapped is None else self._wrapped.states()
+
+    def load_wrapper_states(self, states: list[dict[str, Any]] | None) -> None:
+        """Let `restore` restore what `wrapper_states` returned, for the same settings."""
+        if self._wrapped is not None:
+            self._wrapped.load_states(states)
 
     def close(self) -> None:
         """Close the environments and end the engine process, if there is one."""

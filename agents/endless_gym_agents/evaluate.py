@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from endless_gym.create import make_vec
 from endless_gym.specs import spec
+from endless_gym_agents import wrappers
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.metrics import TASK_PROGRESS, path_length, task_progress
 
@@ -50,15 +50,7 @@ def evaluate(
     memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(action_seed)
     results: list[dict[str, float]] = [{} for _ in episode_seeds]
     paths = {seed: path_length(env_spec.id, options, seed) for seed in seeds}
-    with make_vec(
-        settings.env,
-        num_envs,
-        num_threads,
-        seeds=episode_seeds,
-        options=options,
-        autoreset="same_step",
-        observation=settings.environment.observation,
-    ) as envs:
+    with wrappers.make(settings, num_envs, num_threads, seeds=episode_seeds) as envs:
         observation, _ = envs.reset()
         while not all(results):
             output = agent.act(observation, memory, generator, greedy)

@@ -137,6 +137,8 @@ def check(settings: Settings, agent: Agent) -> None:
     memory = settings.recurrence
     wrong = {
         "--agent must be gru": settings.agent != "gru" and settings.agent,
+        "--encoder must be the package's": settings.encoder,
+        "--environment.wrapper must be empty": " ".join(settings.environment.wrapper),
         "--recurrence.layers must be 1": memory.layers != 1 and memory.layers,
         "--recurrence.residual must be off": memory.residual,
         "--recurrence.embedding must be on": not memory.embedding,

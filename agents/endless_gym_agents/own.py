@@ -1,4 +1,4 @@
-"""Memories of your own: a class in a module or a file, named by `--agent`."""
+"""Classes of your own in a module or a file, named by `--agent`, `--encoder` and `--environment.wrapper`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import importlib
 import importlib.util
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from torch import nn
+T = TypeVar("T")
 
 
 def resolved(name: str) -> str:
@@ -17,25 +17,26 @@ def resolved(name: str) -> str:
     return f"{Path(place).resolve()}:{member}" if place.endswith(".py") else name
 
 
-def load(flag: str, name: str) -> type[nn.Module]:
+def load(flag: str, name: str, base: type[T]) -> type[T]:
     """The class of a name `module:Class` or `file.py:Class`. Its module is imported, and thereby executed.
 
     Args:
         flag: The flag that gave the name, for messages.
         name: The name.
+        base: The class that it must be derived from.
 
     Raises:
-        ValueError: There is no such module, file or class, or the class is not a `torch.nn.Module`.
+        ValueError: There is no such module, file or class, or it is not derived from `base`.
     """
     place, _, member = name.rpartition(":")
     try:
         found = getattr(_module(place), member)
-    except (AttributeError, ImportError, OSError) as error:
+    except (AttributeError, ImportError, OSError, ValueError) as error:
         raise ValueError(
             f"{flag} must be module:Class or file.py:Class of a class that can be imported, got `{name}`: {error}"
         ) from error
-    if not (isinstance(found, type) and issubclass(found, nn.Module)):
-        raise ValueError(f"{flag} must name a class derived from torch.nn.Module, got `{name}`, {found!r}")
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f"{flag} must name a class derived from {base.__name__}, got `{name}`, {found!r}")
     return found
 
 

@@ -24,9 +24,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
-from endless_gym.create import make_vec
 from endless_gym.specs import spec
-from endless_gym_agents import checkpoint, command
+from endless_gym_agents import checkpoint, command, wrappers
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
 from endless_gym_agents.train import choose_device
@@ -117,10 +116,7 @@ def record(agent: Agent, seeds: Sequence[int], max_steps: int = 512, action_seed
     memory, generator = agent.initial_memory(count), torch.Generator(agent.device).manual_seed(action_seed)
     parts: dict[str, list[Tensor]] = {"memory": [], "observation": [], "truth": [], "episode": []}
     running, numbers = torch.ones(count, dtype=torch.bool), torch.arange(count)
-    kind = settings.environment.observation
-    with make_vec(
-        settings.env, count, seeds=list(seeds), options=settings.options(), autoreset="same_step", observation=kind
-    ) as envs:
+    with wrappers.make(settings, count, seeds=list(seeds)) as envs:
         observation, info = envs.reset()
         for _ in range(max_steps):
             agent.acting_weights()

@@ -100,6 +100,11 @@ def execute(arguments: RecordArguments) -> None:
     """Record the episodes, and print what was recorded."""
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     settings = agent.settings
+    if settings.environment.wrapper:
+        raise ValueError(
+            "a data set contains the environment's own observations and rewards; got an agent that was trained with "
+            f"--environment.wrapper {' '.join(settings.environment.wrapper)}"
+        )
     with recording.progress(arguments.episodes) as bar:
         recorded = record(
             settings.env,

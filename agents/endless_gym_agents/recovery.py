@@ -56,6 +56,11 @@ class RecoverableEngine:
         self._pending = [False for _ in groups]
         self._restarts = 0
 
+    @property
+    def unwrapped(self) -> EndlessVectorEnv:
+        """The environments of the current engine, or those that replaced it in this process."""
+        return self._envs
+
     def reset(self, *, group: int) -> tuple[Any, dict[str, Any]]:
         """Start the first episode in every environment of a group."""
         return self._call(lambda envs: envs.reset(group=group))

@@ -96,6 +96,9 @@ def label(settings: Settings) -> str:
         name += f"_b{settings.transformer.gate_bias:g}"
     if settings.agent in ("gru", "lstm") and settings.recurrence.hidden_size != Recurrence().hidden_size:
         name += f"_{settings.recurrence.hidden_size}"
+    encoder = (settings.encoder.rpartition(":")[2], *settings.encoder_option) if settings.encoder else ()
+    wrappers = (wrapper.rpartition(":")[2] for wrapper in settings.environment.wrapper)
+    name += "".join(f"_{part}" for part in (*encoder, *wrappers))
     additions = {
         "_gt": settings.ppo.ground_truth_coefficient,
         "_qpos": trxl and settings.transformer.query_encoding,
@@ -122,6 +125,8 @@ class Experiments:
             settings.env,
             settings.agent,
             settings.agent_option,
+            settings.encoder,
+            settings.encoder_option,
             settings.bf16,
             environment,
             networks,

@@ -193,10 +193,12 @@ class RolloutCollector:
         return {
             "memories": [memory.state_dict() for memory in self.memories],
             "environments": self.environments.snapshots(),
+            "wrappers": self.environments.wrapper_states(),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Load what `state_dict` returned, for the same settings."""
+        self.environments.load_wrapper_states(state_dict.get("wrappers"))
         self.current = self.environments.restore(state_dict["environments"])
         for memory, memory_state in zip(self.memories, state_dict["memories"], strict=True):
             memory.load_state_dict(memory_state)

@@ -14,6 +14,9 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Literal
 
+from gymnasium.vector import VectorWrapper
+from torch import nn
+
 from endless_gym.specs import DEFAULT_ENV_ID, spec
 from endless_gym_agents import own
 from endless_gym_agents.metrics import is_finite
@@ -69,6 +72,9 @@ class Environment:
     """reset parameters, each as NAME=VALUE with a JSON value, such as `command_count=[2]`"""
     observation: Literal["rgb", "features"] = "rgb"
     """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU"""
+    wrapper: tuple[str, ...] = ()
+    """wrappers of your own, from the inside out: module:Class or file.py:Class of a `gymnasium.vector.VectorWrapper`, such as one
+    that shapes the reward"""
     num_envs: int = 32
     """total number of environments in all groups and on all ranks of a data-parallel run; the number of workers in the paper"""
     groups: int = 1
@@ -204,6 +210,11 @@ class Settings:
     as `endless_gym_agents.recurrent.CellMemory` describes"""
     agent_option: tuple[str, ...] = ()
     """arguments of the class of an agent of your own, each as NAME=VALUE with a JSON value"""
+    encoder: str = ""
+    """encoder of your own: module:Class or file.py:Class, a class as `endless_gym_agents.encoders.OwnEncoder` describes; empty
+    for the paper's convolutional network"""
+    encoder_option: tuple[str, ...] = ()
+    """arguments of the class of an encoder of your own, as for `agent-option`"""
     preset: PresetName = "paper"
     """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
     throughput: many environments and short rollouts, with gradients through 32 steps instead of the paper's 512;
@@ -274,6 +285,14 @@ class Settings:
         """
         return _named_values("--agent-option", self.agent_option, "'layers=2'")
 
+    def encoder_options(self) -> dict[str, Any]:
+        """The arguments of an encoder of your own by name.
+
+        Raises:
+            ValueError: As for `options`.
+        """
+        return _named_values("--encoder-option", self.encoder_option, "'width=256'")
+
     @property
     def is_own_agent(self) -> bool:
         """Whether the agent is a class outside this package."""
@@ -293,7 +312,7 @@ class Settings:
         env_spec = spec(self.env)
         env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
         if self.is_own_agent:
-            own.load("--agent", self.agent)
+            own.load("--agent", self.agent, nn.Module)
         elif self.agent not in AGENTS:
             near = difflib.get_close_matches(self.agent, AGENTS, 1)
             hint = f"; did you mean {near[0]}?" if near else ""
@@ -302,6 +321,12 @@ class Settings:
             )
         if self.agent_options() and not self.is_own_agent:
             raise ValueError(f"--agent-option needs an agent of your own, got --agent {self.agent}")
+        if self.encoder:
+            own.load("--encoder", self.encoder, nn.Module)
+        elif self.encoder_options():
+            raise ValueError("--encoder-option needs an encoder of your own, got no --encoder")
+        for wrapper in self.environment.wrapper:
+            own.load("--environment.wrapper", wrapper, VectorWrapper)
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
         for least, names in _LEAST.items():
             for name in names:
@@ -348,10 +373,12 @@ class Settings:
         # As many environment steps as the paper's run of this agent in this environment.
         steps = self.total_steps or paper_run_length(env_spec.id, self.agent) * PAPER_STEPS_PER_UPDATE
         updates = (0 if self.total_steps else ppo.updates) or -(-steps // (environment.num_envs * ppo.steps))
-        agent = own.resolved(self.agent) if self.is_own_agent else self.agent
-        return _replace(
-            dataclasses.replace(self, env=env_spec.id, agent=agent, total_steps=0), ppo={"updates": updates}
-        )
+        return _replace(dataclasses.replace(self, env=env_spec.id, total_steps=0), ppo={"updates": updates}).resolved()
+
+    def resolved(self) -> Settings:
+        """These settings with absolute paths of the files with classes of your own, which hold in other working folders."""
+        settings = dataclasses.replace(self, agent=own.resolved(self.agent), encoder=own.resolved(self.encoder))
+        return _replace(settings, environment={"wrapper": tuple(map(own.resolved, self.environment.wrapper))})
 
     def positions(self) -> int:
         """Rows of the table of positional encodings, with the default resolved."""
@@ -470,5 +497,9 @@ def from_dict(values: dict[str, Any]) -> Settings:
     for part in dataclasses.fields(Settings):
         if dataclasses.is_dataclass(kind := part.default_factory):
             values[part.name] = kind(**values[part.name])
-    values["environment"] = dataclasses.replace(values["environment"], option=tuple(values["environment"].option))
-    return Settings(**values | {"agent_option": tuple(values.get("agent_option", ()))})
+    # JSON has lists for tuples.
+    environment = values["environment"]
+    values["environment"] = dataclasses.replace(
+        environment, option=tuple(environment.option), wrapper=tuple(environment.wrapper)
+    )
+    return Settings(**values | {name: tuple(values.get(name, ())) for name in ("agent_option", "encoder_option")})

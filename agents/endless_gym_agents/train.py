@@ -26,7 +26,7 @@ import torch
 
 from endless_gym import EngineLost
 from endless_gym.episodes import EpisodeOptions
-from endless_gym_agents import checkpoint, command, own, run_folder
+from endless_gym_agents import checkpoint, command, run_folder
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
@@ -266,9 +266,9 @@ def check_resumable(settings: Settings, before: Settings) -> None:
     # The engine and its threads may change, and so may all of PPO except whether the auxiliary heads exist.
     had = before.environment
     environment = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
-    agent = own.resolved(settings.agent) if settings.is_own_agent else settings.agent
-    settings = dataclasses.replace(settings, environment=environment, agent=agent)
-    for name in ("env", "agent", "agent_option", "preset", "seed", "environment", "model", "recurrence", "transformer"):
+    settings = dataclasses.replace(settings, environment=environment).resolved()
+    own = ("agent", "agent_option", "encoder", "encoder_option")
+    for name in ("env", *own, "preset", "seed", "environment", "model", "recurrence", "transformer"):
         given, had = getattr(settings, name), getattr(before, name)
         if given != had:
             raise ValueError(

@@ -27,11 +27,11 @@ SUFFIXES = (".gif", ".webp", ".mp4")
 _BACKGROUND, _TEXT_COLOUR = 24, (230, 230, 230)
 
 
-def compose(observation: NDArray[np.uint8], view: NDArray[np.uint8], text: str) -> Frame:
+def compose(picture: NDArray[np.uint8], view: NDArray[np.uint8], text: str) -> Frame:
     """Compose a frame of a video.
 
     Args:
-        observation: The observation, uint8 (84, 84, 3), indexed [x][y][channel].
+        picture: The environment's frame, uint8 (84, 84, 3), indexed [row][column][channel].
         view: The ground-truth view, uint8 (336, 336, 3), indexed [row][column][channel].
         text: One line of text.
 
@@ -39,8 +39,8 @@ def compose(observation: NDArray[np.uint8], view: NDArray[np.uint8], text: str) 
         uint8 (HEIGHT, WIDTH, 3).
     """
     frame = np.full((HEIGHT, WIDTH, 3), _BACKGROUND, dtype=np.uint8)
-    scale = SIDE // observation.shape[0]
-    frame[:SIDE, :SIDE] = observation.swapaxes(0, 1).repeat(scale, 0).repeat(scale, 1)
+    scale = SIDE // picture.shape[0]
+    frame[:SIDE, :SIDE] = picture.repeat(scale, 0).repeat(scale, 1)
     frame[:SIDE, SIDE + GAP :] = view
     strip = Image.new("RGB", (WIDTH, TEXT), (_BACKGROUND,) * 3)
     draw = ImageDraw.Draw(strip)

@@ -1,9 +1,10 @@
-"""Agents outside the package: the page of the documentation, followed to the letter."""
+"""Memories, encoders and wrappers outside the package: the page of the documentation, followed to the letter."""
 
 import re
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from agents_helpers import changed, collecting, settings
 from endless_gym_agents import checkpoint, enjoy, protocol
 from endless_gym_agents import train as training
 from endless_gym_agents.clock import Clock
+from endless_gym_agents.evaluate import evaluate
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.ppo import learn, make_optimizer
 from endless_gym_agents.results import label
@@ -21,33 +23,40 @@ PAGE = Path(__file__).parents[2] / "docs" / "train" / "own-agents.md"
 PROGRAMS = {"endless-train": training.main, "endless-eval": protocol.main, "endless-enjoy": enjoy.main}
 
 
-def blocks(language: str) -> str:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
 
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "min_gru.py").write_text(blocks("python"))
+    names = re.findall(r"Save (?:it|this) as\s+`(\w+\.py)`", PAGE.read_text())
+    for name, block in zip(names, blocks("python"), strict=True):
+        (tmp_path / name).write_text(block)
     return tmp_path / "min_gru.py"
 
 
+@pytest.mark.parametrize("number", range(3))
 def test_the_commands_of_the_page_work(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: int, file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for line in blocks("sh").replace("\\\n", " ").splitlines():
+    assert len(blocks("sh")) == 3
+    for line in blocks("sh")[number].replace("\\\n", " ").splitlines():
         # Shorter than on the page, since a test needs only a few updates.
         arguments = shlex.split(line.replace("--time-limit 0.1", "--time-limit 0.001"))
         monkeypatch.setattr(sys, "argv", arguments)
         assert PROGRAMS[arguments[0]]() == 0, line
-    assert "MinGRU_layers=2" in capsys.readouterr().out
-    assert len(read_progress(Path("runs/mine"))) == 2
-    assert Path("episode.gif").stat().st_size > 0
-    given = checkpoint.read_settings("runs/mine")
-    assert (given.agent, given.agent_option, label(given)) == (f"{file}:MinGRU", ("layers=2",), "MinGRU_layers=2")
+    (run,) = Path("runs").iterdir()
+    given = checkpoint.read_settings(run)
+    assert label(given) == ("MinGRU_layers=2", "gru_128_Impala_channels=[4, 8]", "gru_128_StepPenalty")[number]
+    assert label(given) in capsys.readouterr().out
+    assert len(read_progress(run)) == blocks("sh")[number].count("endless-train")
+    assert number or Path("episode.gif").stat().st_size > 0
+    own = (given.agent, given.encoder, *given.environment.wrapper)[number]
+    assert own == str(file.parent / ("min_gru.py:MinGRU", "impala.py:Impala", "penalty.py:StepPenalty")[number])
     # From another folder.
     monkeypatch.chdir("/")
-    assert checkpoint.load(file.parent / "runs/mine").agent.memory.width == 128
+    assert checkpoint.load(file.parent / run).agent.memory.width == 128
 
 
 @pytest.mark.parametrize("embedding", [True, False])
@@ -71,6 +80,167 @@ def test_forward_equals_the_rollout_with_the_same_weights(embedding: bool, file:
             assert not torch.equal(before, made.memory.cell.gates[1].weight)
 
 
+def test_acting_with_an_own_encoder_equals_learning_with_it(file: Path) -> None:
+    given = settings("gru", env="MortarMayhem-Grid-v0", encoder=str(file.parent / "impala.py:Impala"), threads=1)
+    given = changed(given, encoder_option=("channels=[2]",), ppo={"steps": 8, "minibatches": 2})
+    given = changed(given, environment={"num_envs": 2, "observation": "rgb"})
+    with collecting(given) as collector:
+        made = collector.agent
+        segment, _ = collector.collect(Clock())
+        flat, states = segment.flat(), [memory.state for memory in collector.memories]
+        (minibatch,) = made.memory.minibatches(states, segment.reset_mask, 1, torch.Generator().manual_seed(1))
+        output = made({key: part[minibatch.indices] for key, part in flat.observation.items()}, minibatch)
+        torch.testing.assert_close(output.value, flat.value[minibatch.indices], rtol=1e-5, atol=1e-5)
+        before = made.encoder.own.layers[0].weight.clone()
+        learn(made, make_optimizer(made, 0.01), segment, states, 0, given.ppo, torch.Generator().manual_seed(1))
+        assert not torch.equal(before, made.encoder.own.layers[0].weight)
+
+
+OWN = '''
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import VectorRewardWrapper, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+
+class Counting(VectorWrapper):
+    """The reward is the number of the episode's step, which is also an observation."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.steps = np.zeros(env.num_envs)
+        self.single_observation_space = spaces.Dict(
+            {"features": env.single_observation_space, "time": spaces.Box(-np.inf, np.inf, (1,), np.float32)}
+        )
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+
+    def reset(self, **given):
+        observation, info = self.env.reset(**given)
+        self.steps = np.zeros(self.num_envs)
+        return self.seen(observation), info
+
+    def step(self, actions):
+        observation, _, terminated, truncated, info = self.env.step(actions)
+        reward = self.steps = self.steps + 1
+        self.steps = np.where(terminated | truncated, 0, self.steps)
+        return self.seen(observation), reward, terminated, truncated, info
+
+    def seen(self, observation):
+        return {"features": observation, "time": self.steps[:, None].astype(np.float32)}
+
+    def state_dict(self):
+        return {"steps": self.steps}
+
+    def load_state_dict(self, state):
+        self.steps = state["steps"]
+
+
+class Forgetful(VectorRewardWrapper):
+    calls = 0
+
+    def rewards(self, rewards):
+        self.calls += 1
+        return rewards
+
+
+class Short(VectorWrapper):
+    @property
+    def num_envs(self):
+        return 1
+
+
+class Argument(VectorWrapper):
+    def __init__(self, env, scale):
+        super().__init__(env)
+
+
+class Wide(VectorWrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.single_observation_space = spaces.Box(0, 1, (2, 2), np.float32)
+
+
+class Flat(torch.nn.Module):
+    def __init__(self, shapes):
+        super().__init__()
+
+    def forward(self, observation):
+        return observation["features"].sum()
+
+
+class Frames(Flat):
+    def forward(self, observation):
+        return observation["visual_observation"]
+'''
+
+
+@pytest.mark.parametrize(("engine", "groups"), [("thread", 2), ("process", 1)])
+def test_a_resumed_run_with_a_wrapper_equals_an_undisturbed_one(
+    engine: str, groups: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN)
+    environment = {"num_envs": 4, "groups": groups, "engine": engine, "wrapper": ("own.py:Counting",)}
+    given = settings("gru", env="MortarMayhem-Grid-v0", threads=1, environment=environment)
+    given = changed(given, ppo={"updates": 4, "steps": 16, "minibatches": 1})
+    whole = checkpoint.load(training.train(changed(given, run="whole")))
+    part = training.train(changed(given, run="part"), lambda update, _: update == 2)
+    resumed = checkpoint.load(training.train(changed(given, resume=str(part))))
+    for name, tensor in whole.agent.state_dict().items():
+        assert torch.equal(tensor, resumed.agent.state_dict()[name]), name
+    states = [checkpoint["player"]["wrappers"] for checkpoint in (whole.state, resumed.state)]
+    assert str(states[0]) == str(states[1])
+    assert sum(float(group["wrappers"][0]["steps"].sum()) for group in states[0]) > 0
+    assert resumed.agent.observation_shapes["time"] == (1,)
+    # The wrapper is part of the evaluation, whose returns are the environment's own.
+    assert max(episode["reward"] for episode in evaluate(resumed.agent, range(2), 1)) <= 1.0
+    with pytest.raises(ValueError, match="a resumed run must keep its environment"):
+        training.train(changed(given, resume=str(part), environment={"wrapper": ()}))
+
+
+def test_the_agent_learns_from_the_wrapped_rewards(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(OWN)
+    environment = {"num_envs": 2, "wrapper": (f"{tmp_path}/own.py:Counting",)}
+    given = settings("gru", env="MortarMayhem-Grid-v0", threads=1, environment=environment, ppo={"steps": 8})
+    with collecting(given) as collector:
+        segment, _ = collector.collect(Clock())
+    assert segment.reward.tolist() == [[step, step] for step in range(1, 9)]
+    assert segment.observation["time"][..., 0].tolist() == [[step, step] for step in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"wrapper": ("own.py:Forgetful",)}, "Forgetful changes its attribute calls while it plays.*`state_dict`"),
+        ({"wrapper": ("own.py:Short",)}, "own.py:Short must keep num_envs, which is 64, got 1"),
+        ({"wrapper": ("own.py:Argument",)}, "own.py:Argument cannot wrap the environments: .* 'scale'"),
+        ({"wrapper": ("own.py:Wide",)}, r"must leave observations that are uint8 .*, got Box\(.*\(2, 2\)"),
+        ({"wrapper": ("own.py:Flat",)}, "must name a class derived from VectorWrapper, got `own.py:Flat`"),
+        ({"wrapper": ("own.py",)}, "must be module:Class or file.py:Class of a class"),
+        (
+            {"wrapper": ("gymnasium.wrappers.vector:FlattenObservation",)},
+            "FlattenObservation cannot wrap the environments: Expected autoreset_mode",
+        ),
+        ({"encoder": "own.py:Counting"}, "--encoder must name a class derived from Module"),
+        ({"encoder": "own.py:Flat"}, r"Flat must encode n observations as a tensor \(n, width\), got \(\) for n = 2"),
+        ({"encoder": "own.py:Frames"}, "Frames cannot encode an observation of {'features': .*: 'visual_observation'"),
+        ({"encoder": "own.py:Flat", "encoder_option": ("a=1",)}, "Flat cannot be made of shapes and --encoder-option"),
+        ({"encoder_option": ("a=1",)}, "--encoder-option needs an encoder of your own"),
+    ],
+)
+def test_encoders_and_wrappers_that_do_not_fit_are_refused(
+    changes: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN)
+    if "wrapper" in changes:
+        changes = {"environment": changes}
+    given = settings("gru", env="MortarMayhem-Grid-v0", run="run", threads=1, ppo={"updates": 2, "steps": 8})
+    with pytest.raises(ValueError, match=message):
+        training.train(changed(given, **changes))
+
+
 @pytest.mark.parametrize(
     ("agent", "option", "message"),
     [
@@ -82,7 +252,7 @@ def test_forward_equals_the_rollout_with_the_same_weights(embedding: bool, file:
         ),
         ("no_such_module:MinGRU", (), "got `no_such_module:MinGRU`: No module named"),
         ("min_gru.py:Other", (), "got `min_gru.py:Other`: .* has no attribute 'Other'"),
-        ("os:system", (), "--agent must name a class derived from torch.nn.Module, got `os:system`"),
+        ("os:system", (), "--agent must name a class derived from Module, got `os:system`"),
         ("min_gru.py:MinGRU", ("depth=2",), "MinGRU cannot be made of .* 'depth'"),
         ("min_gru.py:MinGRU", ("layers",), "--agent-option must be NAME=VALUE with a JSON value"),
         ("gru", ("layers=2",), "--agent-option needs an agent of your own, got --agent gru"),

@@ -34,9 +34,9 @@ def rgb(image: Image.Image) -> np.ndarray:
     return np.asarray(image.convert("RGB"))
 
 
-def test_frame_shows_the_observation_next_to_the_view() -> None:
+def test_frame_shows_the_picture_next_to_the_view() -> None:
     frame = np.zeros((84, 84, 3), np.uint8)
-    frame[10, 20] = (255, 0, 0)  # x 10, y 20
+    frame[20, 10] = (255, 0, 0)
     view = np.random.default_rng(0).integers(256, size=(336, 336, 3), dtype=np.uint8)
     picture = video.compose(frame, view, "one line")
     assert picture.shape == (video.HEIGHT, video.WIDTH, 3)
