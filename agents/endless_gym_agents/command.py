@@ -14,6 +14,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import tyro
 from rich.console import Console
 
+from endless_gym_agents import ranges
+
 T = TypeVar("T")
 
 #: Exit status after SIGINT, by the convention of shells: 128 + 2.
@@ -91,9 +93,17 @@ def run(name: str, work: Callable[[], object]) -> int:
 def main(
     name: str, arguments: type[T], execute: Callable[[T], object], text: str | None, given: list[str] | None = None
 ) -> int:
-    """Parse the arguments `given` to a command, by default the process's, and `run` it; `text` is its module's docstring."""
+    """Parse and check the arguments `given` to a command, by default the process's, and `run` it.
+
+    `text` is the docstring of its module.
+    """
     parsed = parse(arguments, name, text, given)
-    return run(name, lambda: execute(parsed))
+
+    def work() -> None:
+        ranges.check(parsed)
+        execute(parsed)
+
+    return run(name, work)
 
 
 def parse(

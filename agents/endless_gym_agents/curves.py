@@ -93,6 +93,11 @@ def published(env: str, labels: Sequence[str] | None = None) -> list[Curve]:
     return curves
 
 
+def published_labels() -> list[str]:
+    """The agents of which the paper has curves, in any environment."""
+    return list(dict.fromkeys(name for curves in _published()["curves"].values() for name in curves))
+
+
 def published_environments() -> list[str]:
     """Ids of the environments for which the paper has curves."""
     return list(_published()["curves"])

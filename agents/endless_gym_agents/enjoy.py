@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -23,6 +23,7 @@ from endless_gym.vector import EndlessVectorEnv
 from endless_gym_agents import checkpoint, command, video, wrappers
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
+from endless_gym_agents.ranges import Natural, Range
 from endless_gym_agents.train import choose_device
 
 
@@ -32,17 +33,17 @@ class EnjoyArguments:
 
     checkpoint: tyro.conf.Positional[Path]
     """a checkpoint file, or the folder of a run for its last checkpoint"""
-    seeds: tuple[int, ...] = (EVALUATION_SEEDS.start,)
+    seeds: Annotated[tuple[int, ...], Range(0)] = (EVALUATION_SEEDS.start,)
     """seeds of the episodes, which are shown in order"""
     out: Path = Path("episode.gif")
     """output file, .gif (256 colours per frame), .webp (lossless) or .mp4"""
-    action_seed: int = 0
+    action_seed: Natural = 0
     """seed of the action sampling"""
     greedy: bool = False
     """take the most likely actions instead of sampling"""
-    max_steps: int = 1000
+    max_steps: Natural = 1000
     """stop recording an episode after this number of steps; 0 for no limit"""
-    fps: int = 0
+    fps: Natural = 0
     """frames per second; 0 for the environment's frame rate"""
     device: str = "cpu"
     """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
@@ -62,9 +63,9 @@ class EpisodeRecorder:
     """
 
     agent: Agent
-    action_seed: int = 0
+    action_seed: Natural = 0
     greedy: bool = False
-    max_steps: int = 0
+    max_steps: Natural = 0
     rewards: list[float] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
 

@@ -39,6 +39,7 @@ from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.checkpoint import Checkpoint, load
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.metrics import TASK_PROGRESS
+from endless_gym_agents.ranges import Positive
 from endless_gym_agents.settings import Settings, from_dict, to_dict
 
 #: The first bytes of a file.
@@ -63,7 +64,7 @@ class ExportArguments:
     """file to write the agent to; needs a checkpoint"""
     vectors: Path | None = None
     """JSON file to write recorded inputs and outputs of the network to"""
-    vector_steps: int = 96
+    vector_steps: Positive = 96
     """number of recorded steps"""
 
 
@@ -245,8 +246,7 @@ def execute(arguments: ExportArguments) -> None:
 
 def main() -> int:
     """Entry point of this program; returns the exit status."""
-    arguments = command.parse(ExportArguments, "python -m endless_gym_agents.export", __doc__)
-    return command.run("endless_gym_agents.export", lambda: execute(arguments))
+    return command.main("endless_gym_agents.export", ExportArguments, execute, __doc__)
 
 
 if __name__ == "__main__":

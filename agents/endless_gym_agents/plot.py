@@ -33,8 +33,10 @@ from endless_gym_agents.curves import (
     evaluated,
     published,
     published_environments,
+    published_labels,
     training,
 )
+from endless_gym_agents.ranges import Natural
 from endless_gym_agents.results import read
 
 Spread = Literal["std", "iqm", "runs"]
@@ -58,7 +60,7 @@ class PlotArguments:
     spread: Spread = "std"
     """std: mean over the runs and one standard deviation, as in the aggregated plots of the paper; iqm: interquartile mean and
     its 95 % bootstrap interval; runs: one line per run, as in the other plots of the paper"""
-    max_steps: int = 0
+    max_steps: Natural = 0
     """largest number of environment steps to plot; 0 for all"""
 
 
@@ -184,7 +186,9 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
         ValueError: There are no curves for an environment, or too few for an aggregated plot.
     """
     own = read_curves(arguments.paths)
-    known = published_environments()
+    known, labels = published_environments(), published_labels()
+    if unknown := [label for label in arguments.published if label not in labels]:
+        raise ValueError(f"--published must be among {', '.join(labels)}, got `{unknown[0]}`")
     for env in arguments.env:
         if env not in known and env not in {curve.env for curve in own}:
             raise ValueError(f"no curves of environment `{env}`; the paper has curves of {', '.join(known)}")

@@ -16,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 import tyro
@@ -28,6 +29,7 @@ from endless_gym.specs import spec
 from endless_gym_agents import checkpoint, command, wrappers
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
+from endless_gym_agents.ranges import Natural, Positive, Range
 from endless_gym_agents.train import choose_device
 
 
@@ -37,17 +39,17 @@ class ProbeArguments:
 
     checkpoint: tyro.conf.Positional[Path]
     """a checkpoint file, or the folder of a run for its last checkpoint"""
-    first_seed: int = EVALUATION_SEEDS.start
+    first_seed: Natural = EVALUATION_SEEDS.start
     """first seed of the episodes; the seeds are consecutive"""
-    episodes: int = 100
+    episodes: Annotated[int, Range(2)] = 100
     """number of episodes; four fifths train the probes, the others test them"""
-    max_steps: int = 512
+    max_steps: Positive = 512
     """largest number of recorded steps per episode"""
-    action_seed: int = 0
+    action_seed: Natural = 0
     """seed of the action sampling, of the split into training and test episodes, and of the probes"""
     device: str = "auto"
     """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
-    threads: int = 0
+    threads: Natural = 0
     """CPU threads of PyTorch; 0 for PyTorch's default"""
     json: bool = False
     """print JSON instead of a table"""
@@ -208,10 +210,6 @@ def probe(recording: Recording, columns: Sequence[str], seed: int = 0) -> list[S
 
 def execute(arguments: ProbeArguments) -> None:
     """Record, probe, and print the scores."""
-    if arguments.episodes < 2 or arguments.max_steps < 1:
-        raise ValueError(
-            f"--episodes must be 2 or more and --max-steps 1 or more, got {arguments.episodes} and {arguments.max_steps}"
-        )
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent

@@ -27,6 +27,7 @@ from rich.table import Table
 
 from endless_gym_agents import checkpoint, command, metrics
 from endless_gym_agents.evaluate import EVALUATION_SEEDS, REPETITIONS, evaluate
+from endless_gym_agents.ranges import Natural, Positive
 from endless_gym_agents.results import Experiment, Experiments, Run, to_json
 from endless_gym_agents.train import choose_device
 
@@ -39,21 +40,21 @@ class EvalArguments:
     """checkpoint files, folders of runs, or folders that contain runs at any depth"""
     last: bool = False
     """evaluate only the last checkpoint of each run"""
-    first_seed: int = EVALUATION_SEEDS.start
+    first_seed: Natural = EVALUATION_SEEDS.start
     """first seed; the seeds are consecutive"""
-    seeds: int = len(EVALUATION_SEEDS)
+    seeds: Positive = 50
     """number of seeds"""
-    repetitions: int = REPETITIONS
+    repetitions: Positive = REPETITIONS
     """episodes per seed"""
-    action_seed: int = 0
+    action_seed: Natural = 0
     """seed of the action sampling; the same seed gives the same results"""
     greedy: bool = False
     """take the most likely actions instead of sampling; not the protocol of the paper"""
     device: str = "auto"
     """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
-    threads: int = 0
+    threads: Natural = 0
     """CPU threads of PyTorch; 0 for PyTorch's default"""
-    engine_threads: int = 0
+    engine_threads: Natural = 0
     """threads that step the environments; 0 for one per core"""
     json: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
     """write the results to this file, for `endless-plot`; `-` for standard output, instead of the table"""
@@ -114,10 +115,6 @@ def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] 
         FileNotFoundError: A path does not exist, or contains no checkpoint.
         ValueError: A number is out of range, a file is not a checkpoint, or the device is not available.
     """
-    if arguments.seeds < 1 or arguments.repetitions < 1:
-        raise ValueError(
-            f"--seeds and --repetitions must be 1 or more, got {arguments.seeds} and {arguments.repetitions}"
-        )
     runs, device = find(arguments.paths, arguments.last), choose_device(arguments.device)
     if arguments.threads:
         torch.set_num_threads(arguments.threads)

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -23,8 +23,9 @@ from endless_gym.recording import command as recording
 from endless_gym.recording import record
 from endless_gym.recording.players import Actor
 from endless_gym.specs import ObservationName, spec
-from endless_gym_agents import checkpoint, command
+from endless_gym_agents import checkpoint, command, ranges
 from endless_gym_agents.agent import Agent
+from endless_gym_agents.ranges import Natural, Positive, Range
 from endless_gym_agents.train import choose_device
 
 
@@ -34,17 +35,17 @@ class RecordArguments:
 
     checkpoint: tyro.conf.Positional[Path]
     """a checkpoint file, or the folder of a run for its last checkpoint"""
-    episodes: int = 1000
+    episodes: Positive = 1000
     """number of episodes"""
-    error_rates: tuple[float, ...] = (0.0,)
+    error_rates: Annotated[tuple[float, ...], Range(0, 1)] = (0.0,)
     """probability that a step takes a random action instead of the agent's; episodes cycle through several values"""
-    seed: int = 0
+    seed: Natural = 0
     """episode i has the seed SEED + i"""
-    action_seed: int = 0
+    action_seed: Natural = 0
     """seed of the action sampling and of the random actions"""
     greedy: bool = False
     """take the most likely actions instead of sampling"""
-    max_steps: int | None = None
+    max_steps: Annotated[int | None, Range(1)] = None
     """truncate episodes after this number of steps; by default after 1000 in environments without a step limit"""
     name: str | None = None
     """id of the data set; by default endless-gym/ID/agent-v0"""
@@ -54,7 +55,7 @@ class RecordArguments:
     """replace an existing data set with that id"""
     author: str | None = None
     """author in the metadata"""
-    threads: int = 0
+    threads: Natural = 0
     """threads that play; 0 for one per core"""
     json: bool = False
     """print JSON instead of text"""
@@ -98,6 +99,7 @@ class AgentPlayer:
 
 def execute(arguments: RecordArguments) -> None:
     """Record the episodes, and print what was recorded."""
+    ranges.check(arguments)
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     settings = agent.settings
     if settings.environment.wrapper:

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich import box
@@ -30,6 +31,7 @@ from endless_gym_agents import command, ray_session
 from endless_gym_agents.experiments import definitions, planning, running, running_ray
 from endless_gym_agents.experiments.definitions import Experiment
 from endless_gym_agents.experiments.planning import Job
+from endless_gym_agents.ranges import Natural, Positive, Range
 
 
 @dataclass(frozen=True)
@@ -53,23 +55,23 @@ class ReproduceArguments:
     scale: str = "1"
     """a smaller version: a number up to 1, or `tiny` for one update. It multiplies seeds, updates, trials and episodes;
     its square root multiplies environments, steps of a rollout, seeds of the evaluation and the searched parameters"""
-    seeds: tuple[int, ...] = ()
+    seeds: Annotated[tuple[int, ...], Range(0)] = ()
     """seeds of the runs; by default 1 to the number that the paper uses, 5 for most"""
-    jobs: int = 0
+    jobs: Natural = 0
     """runs at the same time; 0 for one per GPU, or without GPUs one per core. With --ray, on all machines together; 0 for as
     many as the resources permit"""
     device: str = "auto"
     """`cpu`, `cuda`, ...; `auto` for CUDA if available, else the CPU. Each run sees one GPU"""
-    nice: int = 19
+    nice: Annotated[int, Range(0, 19)] = 19
     """added to the niceness of the runs, 0 to 19; 19 leaves the cores to all other processes"""
     keep_checkpoints: bool = False
     """keep all checkpoints of evaluated runs, some gigabytes per run, instead of only the last"""
     ray: str = ""
     """run on Ray. The flag alone starts Ray on this machine; with an address, the runs are on that cluster, whose machines must
     share the folder --out"""
-    job_cpus: int = 1
+    job_cpus: Positive = 1
     """with --ray: CPU cores of a run"""
-    job_gpus: float | None = None
+    job_gpus: Annotated[float | None, Range(0)] = None
     """with --ray: GPUs of a run; by default 1 if the cluster has any and the device is not `cpu`"""
 
 
@@ -89,17 +91,9 @@ def listed(experiments: list[Experiment], scale: float) -> Table:
 
 
 def machine_of(arguments: ReproduceArguments) -> running.Machine:
-    """The resources for the runs; with `--ray`, the number of jobs is that of this machine until Ray is connected.
-
-    Raises:
-        ValueError: A number is out of range.
-    """
+    """The resources for the runs; with `--ray`, the number of jobs is that of this machine until Ray is connected."""
     if not arguments.ray:
         return running.machine(arguments.jobs, arguments.device, arguments.nice)
-    if arguments.job_cpus < 1:
-        raise ValueError(f"--job-cpus must be 1 or more, got {arguments.job_cpus}")
-    if arguments.job_gpus is not None and arguments.job_gpus < 0:
-        raise ValueError(f"--job-gpus must be 0 or more, got {arguments.job_gpus}")
     here = running.machine(arguments.jobs, "cpu", arguments.nice)
     # Ray assigns GPUs to each run.
     return replace(here, device=arguments.device, gpus=(), job_cores=arguments.job_cpus)

@@ -24,9 +24,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from endless_gym_agents import checkpoint
+from endless_gym_agents import checkpoint, ranges
 from endless_gym_agents.experiments.planning import flags
 from endless_gym_agents.logs import read_progress
+from endless_gym_agents.ranges import FromZero, Natural, Positive, Range
 from endless_gym_agents.search_space import Choice, Space, single_changes, space, with_choices
 from endless_gym_agents.settings import Settings, to_dict
 from endless_gym_agents.train import choose_device
@@ -48,7 +49,7 @@ class SearchArguments:
     """folder of the search, with the study and the runs of the trials; empty for searches/ENV/AGENT"""
     stage: Literal["both", "single", "combinations"] = "both"
     """single: single changes; combinations: combinations proposed by the TPE; both: first single changes, then combinations"""
-    trials: int = 50
+    trials: Natural = 50
     """total number of combinations; the trials with single changes are additional"""
     parameters: tuple[str, ...] = ()
     """parameters to search, such as ppo.epochs; empty for all of the paper's table"""
@@ -56,28 +57,28 @@ class SearchArguments:
     """when a trial is pruned. percentile: when it falls behind the complete trials, as in the paper; asha (asynchronous
     successive halving): when it is not in the best quarter of the trials that have reached the update --warm-up, 4 or 16 times
     that, and so on; none: never"""
-    percentile: float = 25.0
+    percentile: Annotated[float, Range(0, 100, is_open=True)] = 25.0
     """a trial is pruned if it is not among this best percentage of the trials at the same update"""
-    warm_up: int = 2000
+    warm_up: Natural = 2000
     """updates before a trial can be pruned"""
-    startup_trials: int = 5
+    startup_trials: Natural = 5
     """trials that must be complete before the pruner percentile prunes"""
-    period: int = 50
+    period: Positive = 50
     """updates between two pruning decisions"""
-    minutes: float = 0.0
+    minutes: FromZero = 0.0
     """minutes after which no more trials start and no workers are replaced; 0 for no limit"""
-    workers: int = 0
+    workers: Natural = 0
     """trials that run at the same time on this machine, each in its own process; 0 for one, in this process. With --ray, the
     limit for all machines together; 0 for as many as the resources permit"""
-    max_failures: int = 3
+    max_failures: Natural = 3
     """largest number of killed workers that the search replaces; with --ray, largest number of times that it resumes a failed
     trial. A trial that failed more often is resumed when the command is repeated"""
     ray: str = ""
     """run the trials on Ray Tune. The flag alone starts Ray on this machine; with an address, the trials run on that cluster,
     whose machines must share the folder of the search"""
-    trial_cpus: int = 1
+    trial_cpus: Positive = 1
     """with --ray: CPU cores of a trial"""
-    trial_gpus: float | None = None
+    trial_gpus: Annotated[float | None, Range(0)] = None
     """with --ray: GPUs of a trial; by default 1 if the cluster has any and the device is not `cpu`"""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     """initial settings of the trials"""
@@ -88,21 +89,10 @@ class SearchArguments:
         Raises:
             ValueError: A value is out of range, or a combination is not supported.
         """
+        ranges.check(self)
         settings = self.settings.validated()
         if not self.ray:  # The devices of other machines are not known here.
             choose_device(settings.device)
-        for least, names in {
-            0: ("trials", "warm-up", "startup-trials", "workers", "max-failures"),
-            1: ("period", "trial-cpus"),
-        }.items():
-            for name in names:
-                number = getattr(self, name.replace("-", "_"))
-                if number < least:
-                    raise ValueError(f"--{name} must be {least} or more, got {number}")
-        if self.trial_gpus is not None and self.trial_gpus < 0:
-            raise ValueError(f"--trial-gpus must be 0 or more, got {self.trial_gpus}")
-        if not 0 < self.percentile <= 100:
-            raise ValueError(f"--percentile must be greater than 0 and at most 100, got {self.percentile}")
         if settings.run or settings.resume:
             raise ValueError("--run and --resume are not supported: the search names its runs; use --folder")
         if settings.time_limit or settings.target_reward is not None:

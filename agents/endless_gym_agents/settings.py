@@ -9,17 +9,17 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import math
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from gymnasium.vector import VectorWrapper
 from torch import nn
 
 from endless_gym.specs import DEFAULT_ENV_ID, spec
-from endless_gym_agents import own
+from endless_gym_agents import own, ranges
 from endless_gym_agents.metrics import is_finite
+from endless_gym_agents.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
 
 #: The agents of the package. Others are classes of your own; see `Settings.agent`.
 AGENTS = ("gru", "lstm", "trxl", "gtrxl", "none", "stack", "position")
@@ -29,21 +29,6 @@ PresetName = Literal["paper", "old", "throughput", "throughput-512", "quick"]
 TRAINING_SEEDS = range(100_000)
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
-
-#: Numeric settings by their smallest allowed value.
-_LEAST = {
-    1: (
-        *("environment.num-envs", "environment.groups"),
-        *("ppo.decay-updates", "ppo.steps", "ppo.epochs", "ppo.minibatches"),
-        *("recurrence.layers", "recurrence.hidden-size", "recurrence.sequence-length"),
-        *("transformer.layers", "transformer.heads", "transformer.width", "transformer.sequence-length"),
-        *("model.stack", "model.vector-width", "model.head-width", "checkpoint-interval"),
-    ),
-    0: (
-        *("threads", "total-steps", "ppo.updates", "environment.num-threads"),
-        *("model.body-width", "transformer.positions", "transformer.window"),
-    ),
-}
 
 
 def paper_run_length(env: str, agent: str) -> int:
@@ -75,14 +60,14 @@ class Environment:
     wrapper: tuple[str, ...] = ()
     """wrappers of your own, from the inside out: module:Class or file.py:Class of a `gymnasium.vector.VectorWrapper`, such as one
     that shapes the reward"""
-    num_envs: int = 32
+    num_envs: Positive = 32
     """total number of environments in all groups and on all ranks of a data-parallel run; the number of workers in the paper"""
-    groups: int = 1
+    groups: Positive = 1
     """groups of environments. With two, an engine process steps one group while the agent computes the actions for the other;
     this pays off only if a step takes about as long as computing the actions"""
     engine: Literal["thread", "process"] = "thread"
     """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
-    num_threads: int = 0
+    num_threads: Natural = 0
     """threads that step the environments; 0 for one per core"""
 
 
@@ -90,15 +75,15 @@ class Environment:
 class Recurrence:
     """Memory of the agents gru and lstm."""
 
-    hidden_size: int = 512
+    hidden_size: Positive = 512
     """size of the hidden state"""
-    layers: int = 1
+    layers: Positive = 1
     """number of stacked recurrent layers"""
     residual: bool = False
     """residual connection around the recurrent layers"""
     embedding: bool = True
     """fully connected layer before the recurrent layers"""
-    sequence_length: int = 512
+    sequence_length: Positive = 512
     """length of truncated BPTT in steps; longer segments are cut into sequences that start from stored hidden states"""
 
 
@@ -106,18 +91,18 @@ class Recurrence:
 class Transformer:
     """Memory of the agents trxl (Transformer-XL) and gtrxl (GTrXL)."""
 
-    layers: int = 3
+    layers: Positive = 3
     """number of blocks"""
-    width: int = 384
+    width: Positive = 384
     """embedding dimension of the blocks"""
-    heads: int = 4
+    heads: Positive = 4
     """attention heads per block"""
-    window: int = 0
+    window: Natural = 0
     """length of the sliding attention window: the current step and the past steps that it can attend to; 0 for the length of the
     longest episode, or 256 in endless environments, as in the paper"""
     positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"
     """positional encoding of the cached steps"""
-    positions: int = 0
+    positions: Natural = 0
     """rows of the table of the absolute or learned encoding; 0 for the length of the longest episode, or 2048 in endless
     environments, as in the paper"""
     query_encoding: bool = False
@@ -129,11 +114,11 @@ class Transformer:
     """share the query, key and value projections among the heads of a block, as in the experiments of the paper"""
     gating: bool = False
     """GRU-type gates of GTrXL in place of the residual connections; set by the agent `gtrxl`"""
-    gate_bias: float = 0.0
+    gate_bias: Finite = 0.0
     """initial bias of the gates; with a larger one, blocks start closer to the identity. The paper uses 0 and 2"""
     initialisation: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """weight initialisation of the blocks"""
-    sequence_length: int = 1
+    sequence_length: Positive = 1
     """number of consecutive steps that are shuffled together into minibatches. 1, as in the paper: single steps. Longer
     sequences make learning faster and need less memory, but the gradients of long episodes are noisier"""
 
@@ -142,16 +127,16 @@ class Transformer:
 class Model:
     """Layers before and after the memory."""
 
-    vector_width: int = 128
+    vector_width: Positive = 128
     """units of the encoder of vector observations (features, vector observation, position)"""
-    body_width: int = 0
+    body_width: Natural = 0
     """units of the layer after the memory; 0 for the memory's output size, or `recurrence.hidden-size` without a memory"""
-    head_width: int = 512
+    head_width: Positive = 512
     """units of the hidden layers of the policy and value heads"""
-    value_gain: float = 1.0
+    value_gain: Finite = 1.0
     """gain of the initial weights of the value head's output layer; a small gain speeds up the first updates if rewards are
     small"""
-    stack: int = 4
+    stack: Positive = 4
     """number of stacked grey frames of the agent `stack`; the paper uses 4 and 16"""
 
 
@@ -159,42 +144,42 @@ class Model:
 class PPO:
     """Proximal policy optimisation and loss coefficients."""
 
-    updates: int = 0
+    updates: Natural = 0
     """number of updates of the run; one update uses `num_envs * steps` environment steps. 0 for as many environment steps as the
     paper's runs: 50,000 of its updates in endless environments, 30,000 in MortarMayhem, 25,000 or fewer in MysteryPath and
     SearingSpotlights, 10,000 in the grids"""
-    decay_updates: int = 10_000
+    decay_updates: Positive = 10_000
     """updates over which learning rate and entropy coefficient decay linearly to their final values"""
-    steps: int = 512
+    steps: Positive = 512
     """rollout length: steps of each environment per update; the worker steps of the paper"""
-    epochs: int = 3
+    epochs: Positive = 3
     """epochs per update"""
-    minibatches: int = 8
+    minibatches: Positive = 8
     """minibatches per epoch"""
-    gamma: float = 0.995
+    gamma: Share = 0.995
     """discount factor"""
-    gae_lambda: float = 0.95
+    gae_lambda: Share = 0.95
     """lambda of generalised advantage estimation"""
-    clip_range: float = 0.1
+    clip_range: AboveZero = 0.1
     """clip range epsilon of the policy loss and of the value loss"""
     advantage_normalisation: Literal["none", "batch", "minibatch"] = "none"
     """normalise advantages over the whole batch, over each minibatch, or not at all"""
-    value_coefficient: float = 0.5
+    value_coefficient: FromZero = 0.5
     """coefficient of the value loss"""
-    learning_rate: float = 2.75e-4
+    learning_rate: FromZero = 2.75e-4
     """initial learning rate of AdamW"""
-    final_learning_rate: float = 1.0e-5
+    final_learning_rate: FromZero = 1.0e-5
     """learning rate after its decay"""
-    entropy_coefficient: float = 1.0e-4
+    entropy_coefficient: FromZero = 1.0e-4
     """initial coefficient of the entropy bonus"""
-    final_entropy_coefficient: float = 1.0e-6
+    final_entropy_coefficient: FromZero = 1.0e-6
     """coefficient of the entropy bonus after its decay"""
-    reconstruction_coefficient: float = 0.0
+    reconstruction_coefficient: FromZero = 0.0
     """coefficient of the observation reconstruction loss; 0 for no reconstruction head. The paper uses 0.1"""
-    ground_truth_coefficient: float = 0.0
+    ground_truth_coefficient: FromZero = 0.0
     """coefficient of the ground-truth estimation loss; 0 for no such head. The authors' configurations use 1. Only for
     environments with `ground_truth` in `info`"""
-    max_gradient_norm: float = 0.25
+    max_gradient_norm: AboveZero = 0.25
     """gradient clipping: largest global norm of the gradients"""
 
 
@@ -220,11 +205,11 @@ class Settings:
     throughput: many environments and short rollouts, with gradients through 32 steps instead of the paper's 512;
     throughput-512: many environments with the paper's 512 steps;
     quick: small networks and feature observations; takes minutes on two CPU cores, and stops when the task is learnt"""
-    seed: int = 1
+    seed: Natural = 1
     """seed of the initial weights, the episode seeds and all sampling"""
     device: str = "auto"
     """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
-    threads: int = 0
+    threads: Natural = 0
     """CPU threads of PyTorch; 0 for PyTorch's default"""
     bind_cores: bool = False
     """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
@@ -240,11 +225,11 @@ class Settings:
     init_from: str = ""
     """start from the weights of this checkpoint, or of the last one of the run in this folder, for transfer and curricula;
     weights whose shapes differ, as those of another action space, keep their initial values. The optimizer is new"""
-    total_steps: int = 0
+    total_steps: Natural = 0
     """environment steps of the run, rounded up to a whole update; replaces --ppo.updates"""
-    checkpoint_interval: int = 100
+    checkpoint_interval: Positive = 100
     """updates between two checkpoints; the last update always writes a checkpoint"""
-    checkpoint_minutes: float = 10.0
+    checkpoint_minutes: FromZero = 10.0
     """largest number of minutes between two checkpoints; 0 for no limit"""
     keep_checkpoints: bool = False
     """keep all checkpoints, for evaluation, instead of only the last"""
@@ -252,9 +237,9 @@ class Settings:
     """what to do when the engine process ends or does not answer. restart: start another one, which continues exactly; after
     three restarts without a completed update, as `save`. save: complete the update in this process, write a checkpoint and stop.
     fail: stop at once"""
-    time_limit: float = 0.0
+    time_limit: FromZero = 0.0
     """minutes after which training stops with a checkpoint; 0 for no limit"""
-    target_reward: float | None = None
+    target_reward: Annotated[float | None, Range()] = None
     """stop when the mean reward of the last 100 episodes reaches this value"""
     stop_when_learnt: bool = False
     """stop when the last 100 episodes show that the task is learnt: with 90 % of the best possible reward in Mortar Mayhem, with
@@ -309,6 +294,7 @@ class Settings:
         Raises:
             ValueError: A value is out of range, or a combination is not supported.
         """
+        ranges.check(self)
         env_spec = spec(self.env)
         env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
         if self.is_own_agent:
@@ -328,19 +314,14 @@ class Settings:
         for wrapper in self.environment.wrapper:
             own.load("--environment.wrapper", wrapper, VectorWrapper)
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
-        for least, names in _LEAST.items():
-            for name in names:
-                number = value(self, name.replace("-", "_"))
-                if number < least:
-                    raise ValueError(f"--{name} must be {least} or more, got {number}")
-        for name in ("checkpoint_minutes", "time_limit"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"--{name.replace('_', '-')} must be 0 or more minutes, got {getattr(self, name)}")
         if environment.num_envs % environment.groups:
             raise ValueError(
                 f"--environment.num-envs must be a multiple of --environment.groups, got {environment.num_envs} environments and "
                 f"{environment.groups} groups"
             )
+        if ppo.minibatches > environment.num_envs * ppo.steps:
+            steps = environment.num_envs * ppo.steps
+            raise ValueError(f"--ppo.minibatches must be 1 to {steps}, the steps of an update, got {ppo.minibatches}")
         if self.view and environment.engine != "process":
             raise ValueError(
                 "--view needs environments in an engine process, got --environment.engine "

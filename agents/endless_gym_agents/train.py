@@ -269,11 +269,11 @@ def check_resumable(settings: Settings, before: Settings) -> None:
     settings = dataclasses.replace(settings, environment=environment).resolved()
     own = ("agent", "agent_option", "encoder", "encoder_option")
     for name in ("env", *own, "preset", "seed", "environment", "model", "recurrence", "transformer"):
-        given, had = getattr(settings, name), getattr(before, name)
-        if given != had:
-            raise ValueError(
-                f"a resumed run must keep its {name}: expected {had}, got {given}; omit the flag, or start a new run"
-            )
+        for part, given, had in _parts(name, getattr(settings, name), getattr(before, name)):
+            if given != had:
+                raise ValueError(
+                    f"a resumed run must keep its {part}: expected {had}, got {given}; omit the flag, or start a new run"
+                )
     for name in ("reconstruction", "ground_truth"):
         given, had = (getattr(each.ppo, f"{name}_coefficient") for each in (settings, before))
         if bool(given) != bool(had):
@@ -281,6 +281,14 @@ def check_resumable(settings: Settings, before: Settings) -> None:
                 f"a resumed run must keep its heads: --ppo.{name.replace('_', '-')}-coefficient must stay "
                 f"{'positive' if had else '0'} (it was {had:g}), got {given:g}; omit the flag, or start a new run"
             )
+
+
+def _parts(name: str, given: Any, had: Any) -> list[tuple[str, Any, Any]]:
+    """A setting, or the settings of a group, each with its name as a flag and two values."""
+    if not dataclasses.is_dataclass(given):
+        return [(name.replace("_", "-"), given, had)]
+    fields = (field.name for field in dataclasses.fields(given))
+    return [(f"{name}.{field.replace('_', '-')}", getattr(given, field), getattr(had, field)) for field in fields]
 
 
 def restore_generator(generator: torch.Generator, state: torch.Tensor, seed: int) -> None:

@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from agents_helpers import saved, settings
 
-from endless_gym_agents import enjoy, plot, protocol, reproduce, search, train
+from endless_gym_agents import enjoy, plot, probe, protocol, record, reproduce, search, train
+from endless_gym_agents.settings import to_dict
 
 GRID = "--env MortarMayhem-Grid-v0"
 NO_RAY = "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"
@@ -17,6 +19,8 @@ PROGRAMS = {
     "endless-eval": protocol.main,
     "endless-enjoy": enjoy.main,
     "endless-plot": plot.main,
+    "endless-probe": probe.main,
+    "endless-record": record.main,
     "endless-search": search.main,
     "endless-reproduce": reproduce.main,
 }
@@ -36,7 +40,42 @@ PROGRAMS = {
         ("endless-eval nowhere", "no such file or folder: nowhere; expected a checkpoint file"),
         ("endless-eval .", "no checkpoint in .; expected the folder of a run"),
         ("endless-eval text.pt", "text.pt is not a checkpoint of this version of endless-train"),
-        ("endless-eval text.pt --seeds 0", "--seeds and --repetitions must be 1 or more, got 0 and 3"),
+        *(
+            (f"endless-train {GRID} --{flag} {given}", f"--{flag} must be {allowed}, got {given}")
+            for flag, given, allowed in (
+                ("environment.num-envs", "0", "1 or more"),
+                ("seed", "-1", "0 or more"),
+                ("time-limit", "-3.0", "0 or more"),
+                ("target-reward", "nan", "finite"),
+                ("model.value-gain", "inf", "finite"),
+                ("ppo.learning-rate", "-1.0", "0 or more"),
+                ("ppo.learning-rate", "nan", "0 or more"),
+                ("ppo.final-learning-rate", "inf", "0 or more"),
+                ("ppo.clip-range", "0.0", "greater than 0"),
+                ("ppo.max-gradient-norm", "-1.0", "greater than 0"),
+                ("ppo.entropy-coefficient", "-0.1", "0 or more"),
+                ("ppo.gamma", "1.5", "0 to 1"),
+                ("ppo.gae-lambda", "-0.5", "0 to 1"),
+                ("ppo.minibatches", "16385", "1 to 16384, the steps of an update"),
+            )
+        ),
+        (
+            f"endless-train {GRID} --agent trxl --ppo.steps 500 --transformer.sequence-length 64",
+            "--ppo.steps must be a multiple of --transformer.sequence-length, got 500 steps and sequences of 64",
+        ),
+        ("endless-train --env mortarmayhem-grid-v0", "id must be .*; did you mean MortarMayhem-Grid-v0?"),
+        ("endless-eval text.pt --seeds 0", "--seeds must be 1 or more, got 0"),
+        ("endless-eval text.pt --threads -1", "--threads must be 0 or more, got -1"),
+        ("endless-eval text.pt --first-seed -1", "--first-seed must be 0 or more, got -1"),
+        ("endless-enjoy text.pt --fps -1", "--fps must be 0 or more, got -1"),
+        ("endless-enjoy text.pt --max-steps -1", "--max-steps must be 0 or more, got -1"),
+        ("endless-enjoy text.pt --seeds 1 -1", "--seeds must be 0 or more, got -1"),
+        ("endless-probe text.pt --max-steps 0", "--max-steps must be 1 or more, got 0"),
+        ("endless-record text.pt --error-rates 0 2", "--error-rates must be 0 to 1, got 2.0"),
+        ("endless-record text.pt --episodes 0", "--episodes must be 1 or more, got 0"),
+        ("endless-search --minutes -1", "--minutes must be 0 or more, got -1.0"),
+        ("endless-plot --published gru nope", "--published must be among gru, .*, got `nope`"),
+        ("endless-reproduce finite --seeds -1 --status", "--seeds must be 0 or more, got -1"),
         ("endless-eval text.pt --json none/results.json", "cannot write none/results.json: no folder none"),
         ("endless-eval text.pt --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
         ("endless-enjoy nowhere", "no checkpoint nowhere"),
@@ -105,3 +144,47 @@ def test_user_error_prints_one_line_and_leaves_no_file(
         "one.json",
         "settings.json",
     }
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "meant"),
+    [
+        (f"endless-train {GRID}", "--ppo.num-epochs 0", "--ppo.epochs"),
+        (f"endless-train {GRID}", "--agnet gru", "--agent"),
+        ("endless-eval .", "--sedes 3", "--seeds"),
+        ("endless-enjoy .", "--seed 3", "--seeds"),
+        ("endless-plot", "--agregate endless", "--aggregate"),
+        ("endless-probe .", "--episode 10", "--episodes"),
+        ("endless-search", "--prunner asha", "--pruner"),
+        ("endless-reproduce finite", "--scales 1", "--scale"),
+    ],
+)
+def test_an_unknown_flag_suggests_the_nearest(
+    command: str, given: str, meant: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [*command.split(), *given.split()])
+    with pytest.raises(SystemExit) as ended:
+        PROGRAMS[command.split()[0]]()
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert re.search(rf"Unrecognized options: {given.split()[0]}\b", error), error
+    assert re.search(rf"Perhaps you meant:.*{meant}\b", error, re.DOTALL), error
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--environment.num-envs 3", "must keep its environment.num-envs: expected 4, got 3; omit the flag"),
+        ("--recurrence.hidden-size 8", "must keep its recurrence.hidden-size: expected 16, got 8; omit the flag"),
+        ("--agent lstm", "must keep its agent: expected gru, got lstm; omit the flag"),
+    ],
+)
+def test_a_resumed_run_names_the_flag_that_differs(
+    flag: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = settings("gru", env="MortarMayhem-Grid-v0", threads=1, environment={"num_envs": 4}).validated()
+    saved(tmp_path, given)
+    (tmp_path / "settings.json").write_text(json.dumps(to_dict(given)))
+    monkeypatch.setattr(sys, "argv", ["endless-train", "--resume", str(tmp_path), *flag.split()])
+    assert train.main() == 1
+    assert message in capsys.readouterr().err

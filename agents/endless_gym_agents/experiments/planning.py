@@ -156,15 +156,10 @@ def jobs(experiment: Experiment, out: Path, scale: float, seeds: Sequence[int] =
         out: Folder for all experiments.
         scale: Scale of the experiment.
         seeds: Seeds; empty for 1 to the number that the experiment names.
-
-    Raises:
-        ValueError: A seed is negative.
     """
     experiment = scaled(experiment, scale)
     folder = folder_of(out, scale) / "runs"
     chosen = tuple(seeds) or range(1, experiment.seeds + 1)
-    if min(chosen) < 0:
-        raise ValueError(f"--seeds must be 0 or more, got {min(chosen)}")
     return [
         Job(experiment, run, seed, folder / run.env / run.name / f"seed-{seed}")
         for seed in chosen

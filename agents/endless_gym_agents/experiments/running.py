@@ -72,15 +72,7 @@ def cores() -> int:
 
 
 def machine(jobs: int, device: str, nice: int = 19) -> Machine:
-    """The local machine with a number of jobs at the same time; 0 for one per GPU, or without GPUs one per core.
-
-    Raises:
-        ValueError: A number is out of range.
-    """
-    if not 0 <= nice <= 19:
-        raise ValueError(f"--nice must be 0 to 19, got {nice}")
-    if jobs < 0:
-        raise ValueError(f"--jobs must be 0 or more, got {jobs}")
+    """The local machine with a number of jobs at the same time; 0 for one per GPU, or without GPUs one per core."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     count = torch.cuda.device_count() if device in ("auto", "cuda") else 0
     gpus = tuple(given.split(",")[:count]) if given else tuple(map(str, range(count)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -196,7 +197,10 @@ def spec(id: str) -> Spec:
     known = all_specs()
     name = id.removeprefix("EndlessGym/")
     if name not in known:
-        raise ValueError(f"id must be one of {', '.join(known)}, got {id!r}")
+        by_lower = {each.lower(): each for each in known}
+        near = difflib.get_close_matches(name.lower(), by_lower, 1)
+        hint = f"; did you mean {by_lower[near[0]]}?" if near else ""
+        raise ValueError(f"id must be one of {', '.join(known)}, got {id!r}{hint}")
     return known[name]
 
 
