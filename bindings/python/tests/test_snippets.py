@@ -78,8 +78,10 @@ def programs(file: Path) -> list[list[Block]]:
 
 
 TIMEOUT = 280
-#: Ends engines so that they remove their segments. SIGINT could get lost while Python starts.
-END_JOBS = "kill -TERM $(jobs -p) 2>/dev/null || true; wait"
+#: Fails if the block leaves programs running, after it has ended them so that engines remove their segments.
+END_JOBS = """status=$?
+for _ in {1..100}; do [ "$(jobs -pr)" ] || exit $status; sleep 0.1; done
+jobs; kill -TERM $(jobs -pr); wait; exit 99"""
 ALL_PROGRAMS = [program for page in pages() for program in programs(page)]
 PROGRAMS = [program for program in ALL_PROGRAMS if not program[0].libraries]
 OF_LIBRARIES = [program for program in ALL_PROGRAMS if program[0].libraries]
