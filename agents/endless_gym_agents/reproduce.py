@@ -28,6 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from endless_gym_agents import command, ray_session
+from endless_gym_agents.clock import duration
 from endless_gym_agents.experiments import definitions, planning, running, running_ray
 from endless_gym_agents.experiments.definitions import Experiment
 from endless_gym_agents.experiments.planning import Job
@@ -132,11 +133,15 @@ def execute(arguments: ReproduceArguments) -> None:
                 print(running.shown(line, machine, number))
         return
     if arguments.status:
-        for job in planned:
+        seconds = planning.seconds_left(planned)
+        for number, job in enumerate(planned):
             state, trained = job.state(), min(job.updates_done(), job.updates)
             of = f", update {trained} of {job.updates}" if job.updates else ""
             if job.experiment.kind == "curves" and state != "done" and trained == job.updates:
                 of += ", evaluation left"
+            elif trained < job.updates and seconds is not None:
+                of += f", {duration(seconds[number])} left"
+                of += "" if planning.update_seconds(job) else ", estimated from other runs"
             console.print(f"{state:<11}  {job.title}{of}", soft_wrap=True)
     side_by_side = "on Ray" if arguments.ray else f"{machine.jobs} at a time"
     console.print(f"{running.left(planned, machine.jobs)}, {side_by_side}", soft_wrap=True)

@@ -274,29 +274,41 @@ def _estimate(planned: Sequence[Job], measured: Callable[[Job], float | None]) -
     return estimate
 
 
+def seconds_left(planned: Sequence[Job]) -> list[float] | None:
+    """Estimated seconds that each job still takes; None before the first measured update.
+
+    A job without a measured update is estimated from the seconds per environment step of the others. Evaluations are included
+    once the first one is done.
+    """
+
+    def steps(job: Job) -> int:
+        settings = job.run.settings()
+        return settings.environment.num_envs * settings.ppo.steps
+
+    def per_step(job: Job) -> float | None:
+        times = update_seconds(job)
+        return statistics.median(times) / steps(job) if times else None
+
+    training, evaluation = _estimate(planned, per_step), _estimate(planned, evaluation_seconds)
+    if training is None:
+        return None
+    left = [max(0, job.updates - job.updates_done()) * steps(job) * training(job) for job in planned]
+    if evaluation is not None:
+        for number, job in enumerate(planned):
+            if job.experiment.kind == "curves" and not _complete(job.folder / EVALUATION):
+                left[number] += evaluation(job)
+    return left
+
+
 def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None:
     """Estimated seconds until all jobs are done; None before the first measured update.
-
-    Evaluations are included once the first one is done.
 
     Args:
         planned: The jobs.
         side_by_side: Number of jobs that run at the same time.
     """
-
-    def median(job: Job) -> float | None:
-        times = update_seconds(job)
-        return statistics.median(times) if times else None
-
-    training, evaluation = _estimate(planned, median), _estimate(planned, evaluation_seconds)
-    if training is None:
-        return None
-    left = [max(0, job.updates - job.updates_done()) * training(job) for job in planned]
-    if evaluation is not None:
-        for number, job in enumerate(planned):
-            if job.experiment.kind == "curves" and not _complete(job.folder / EVALUATION):
-                left[number] += evaluation(job)
-    return max(sum(left) / side_by_side, max(left))
+    left = seconds_left(planned)
+    return None if left is None else max(sum(left) / side_by_side, max(left))
 
 
 def as_json(experiment: Experiment, scale: float) -> dict[str, Any]:
