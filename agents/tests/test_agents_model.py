@@ -112,6 +112,15 @@ def test_run_lengths_are_those_of_the_published_curves() -> None:
     assert changed(PAPER, ppo={"updates": 7}).validated().ppo.updates == 7
 
 
+def test_preset_overnight_reaches_the_first_point_of_the_published_curves() -> None:
+    given = PRESETS["overnight"].validated()
+    steps = given.environment.num_envs * given.ppo.steps * given.ppo.updates
+    (curve,) = curves.published(given.env, ["gru"])
+    assert (given.env, given.environment.observation) == ("Endless-MortarMayhem-v0", "rgb")
+    assert steps == curve.steps[1] == 8_192_000
+    assert changed(given, preset="paper", ppo={"updates": PAPER.validated().ppo.updates}) == PAPER.validated()
+
+
 def test_preset_throughput_512_keeps_the_steps_of_the_paper() -> None:
     given = PRESETS["throughput-512"].validated()
     assert (given.environment.num_envs, given.ppo.steps, given.recurrence.sequence_length) == (128, 512, 512)
