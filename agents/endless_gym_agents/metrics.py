@@ -28,11 +28,16 @@ METRICS = {
 
 def metric(env: str) -> tuple[str, str]:
     """Name of an environment's metric in the results, and its plot label."""
-    return METRICS.get(env, (TASK_PROGRESS, "Task progress"))
+    return METRICS.get(env, (TASK_PROGRESS, "Task progress") if has_progress(env) else ("reward", "Return"))
+
+
+def has_progress(env: str) -> bool:
+    """Whether the task progress is defined: in the finite environments of Memory Gym."""
+    return env.startswith(("MortarMayhem", "MysteryPath", "SearingSpotlights"))
 
 
 def is_finite(env: str) -> bool:
-    """Whether the environment is finite, so that its metric is the task progress."""
+    """Whether the environment is not one of the endless ones, whose episodes get longer the better the agent is."""
     return env not in METRICS
 
 
@@ -67,10 +72,10 @@ def task_progress(spec: Spec, options: Mapping[str, Any], final: Mapping[str, fl
         path: Length of the path, from `path_length`; only used in Mystery Path.
 
     Returns:
-        The task progress; None in an endless environment.
+        The task progress; None in endless environments and in those of others.
     """
     parameters = {**spec.reset_parameters, **options}
-    if not is_finite(spec.id):
+    if not has_progress(spec.id):
         return None
     if spec.id.startswith("MortarMayhem"):
         return _commands(parameters, final)

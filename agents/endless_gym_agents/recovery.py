@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from endless_gym import _native
+from endless_gym import EngineLost
 from endless_gym.results import Step
 from endless_gym.vector import EndlessVectorEnv
 
@@ -102,7 +102,7 @@ class RecoverableEngine:
         while True:
             try:
                 return call(self._envs)
-            except (_native.EngineLost, TimeoutError) as error:
+            except (EngineLost, TimeoutError) as error:
                 if self._policy == "fail" or self.failure is not None:
                     raise
                 self._recover("does not answer" if isinstance(error, TimeoutError) else "has ended")
@@ -127,7 +127,7 @@ class RecoverableEngine:
                         f"a new engine process continues the update, after {steps} steps that were played again"
                     )
                 return
-            except (_native.EngineLost, TimeoutError, RuntimeError, OSError) as error:
+            except (EngineLost, TimeoutError, RuntimeError, OSError) as error:
                 if self.failure is not None:
                     raise
                 reason = f"cannot be replaced ({error})"

@@ -355,7 +355,8 @@ class Settings:
         # As many environment steps as the paper's run of this agent in this environment.
         steps = self.total_steps or paper_run_length(env_spec.id, self.agent) * PAPER_STEPS_PER_UPDATE
         updates = (0 if self.total_steps else ppo.updates) or -(-steps // (environment.num_envs * ppo.steps))
-        return _replace(dataclasses.replace(self, env=env_spec.id, total_steps=0), ppo={"updates": updates}).resolved()
+        settings = dataclasses.replace(self, env=env_spec.full_id, total_steps=0)
+        return _replace(settings, ppo={"updates": updates}).resolved()
 
     def resolved(self) -> Settings:
         """These settings with absolute paths of the files with classes of your own, which hold in other working folders."""

@@ -200,7 +200,7 @@ def parse(name: str, text: str) -> Experiment:
         row = f"{where}, run {number + 1}"
         run = Run(**_checked(Run, one, row))
         try:
-            run = dataclasses.replace(run, env=spec(run.env).id)
+            run = dataclasses.replace(run, env=spec(run.env).full_id)
             run.settings()
         except ValueError as error:
             raise ValueError(f"{row}: {error}") from None

@@ -12,11 +12,12 @@ envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # a ve
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from endless_gym._native import EngineLost, TooManyBatchesHeld, __version__, running_engines
+from endless_gym._native import __version__, running_engines
 from endless_gym.env import Env
+from endless_gym.exceptions import EngineLost, TooManyBatchesHeld
 from endless_gym.experts import Experts
 from endless_gym.interop import DLPackView, pin_memory, torch_view
-from endless_gym.registration import register
+from endless_gym.registration import register, register_envs
 from endless_gym.replay import ReplayStep, replay
 from endless_gym.specs import Frames, all_specs, spec
 from endless_gym.window import WindowClosed
@@ -47,6 +48,7 @@ __all__ = [
     "pin_memory",
     "record",
     "register",
+    "register_envs",
     "replay",
     "running_engines",
     "serve",

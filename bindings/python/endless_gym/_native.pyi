@@ -17,12 +17,6 @@ MAX_GROUPS: int
 MAX_THREADS: int
 MAX_BATCHES_HELD: int
 
-class EngineLost(ConnectionError):
-    """The engine has ended, or has been replaced by another engine."""
-
-class TooManyBatchesHeld(BufferError):
-    """Arrays of this process hold all batches that the engine can lend."""
-
 # A seed `s`: environment `i` of group `g` is seeded with `s + g * num_envs + i`. Or a mask and seeds, one of each per
 # environment: 0 does not reset, 1 starts the next episode, 2 starts one with the seed.
 Reset = int | tuple[Sequence[int], Sequence[int]]

@@ -102,7 +102,7 @@ def checked_arguments(
         for group in range(groups)
     ]
     for pool in pools:
-        _native.check_pool_config(json_text(pool))
+        described.native.check_pool_config(json_text(pool))
     return Arguments(described, threads, mode, frames, pools)
 
 

@@ -97,7 +97,7 @@ def make_vec(
         first_env,
         total_envs,
     )
-    pools = _native.Pools([json_text(config) for config in given.pools], given.num_threads)
+    pools = given.described.native.Pools([json_text(config) for config in given.pools], given.num_threads)
     layout = json.loads(pools.layout())
     return _environments(
         pools,

@@ -22,7 +22,7 @@ from endless_gym.engine_log import EngineLog, level
 from endless_gym.episodes import EpisodeOptions, validate_episode_options
 from endless_gym.program import program
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
-from endless_gym.specs import Frames, ObservationName, json_text
+from endless_gym.specs import Frames, ObservationName, json_text, spec
 from endless_gym.vector import EndlessVectorEnv
 
 _numbers = count()
@@ -39,7 +39,7 @@ class EngineProcess:
         """Start the process, which reads the JSON object of its `EngineConfig` from its standard input."""
         self.service = config["service"]
         self._process = subprocess.Popen(
-            [*program(), *level(), "serve", f"--child={os.getpid()}", "--config=-"],
+            [*program(spec(config["pool"]["id"]).native), *level(), "serve", f"--child={os.getpid()}", "--config=-"],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -217,7 +217,8 @@ class Env(gymnasium.Env[Any, Any]):
             "features": self._features,
             "independent_episodes": self._independent_episodes,
         }
-        return _native.Single(json_text(config))
+        single: _native.Single = self._spec.native.Single(json_text(config))
+        return single
 
     def _check_window(self) -> None:
         """Raises `WindowClosed` if the user has closed the window."""

@@ -42,7 +42,7 @@ class Experts:
     def __init__(self, id: str, num_envs: int = 1) -> None:
         self._spec: Spec = spec(id)
         self.num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
-        self._native = _native.Experts(self._spec.id, self.num_envs)
+        self._native = self._spec.native.Experts(self._spec.id, self.num_envs)
 
     def act(self, observation: Any, episode_start: Any, active: Any = None) -> NDArray[np.int64]:
         """Choose the actions. Call it exactly once for each observation, including the first of an episode.

@@ -1,6 +1,7 @@
 """The command that starts the program `endless` in a new process."""
 
 import sys
+from types import ModuleType
 
 from endless_gym import _native
 
@@ -14,7 +15,7 @@ import sys
 if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 from importlib.util import module_from_spec, spec_from_file_location
-spec = spec_from_file_location("_native", sys.argv[1])
+spec = spec_from_file_location(sys.argv[1].rpartition("/")[2].partition(".")[0], sys.argv[1])
 native = module_from_spec(spec)
 spec.loader.exec_module(native)
 executable = [sys.executable, "-I", "-S", "-c", sys.orig_argv[sys.orig_argv.index("-c") + 1], sys.argv[1]]
@@ -22,6 +23,6 @@ sys.exit(native.endless(sys.argv[2:], executable))
 """
 
 
-def program() -> list[str]:
-    """The command that starts the program `endless`."""
-    return [sys.executable, "-I", "-S", "-c", _PROGRAM, str(_native.__file__)]
+def program(native: ModuleType = _native) -> list[str]:
+    """The command that starts the program `endless` with the environments of a native module."""
+    return [sys.executable, "-I", "-S", "-c", _PROGRAM, str(native.__file__)]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from endless_gym.env import Env
-from endless_gym.specs import all_specs
+from endless_gym.specs import Spec, add_specs, all_specs
 
 if TYPE_CHECKING:
     from endless_gym.vector import EndlessVectorEnv
@@ -19,7 +21,27 @@ def register(namespace: str | None = "EndlessGym") -> None:
     Args:
         namespace: Prefix of the ids. `None` registers the original's ids, for code that uses them.
     """
-    for spec in all_specs().values():
+    _register(all_specs().values(), namespace)
+
+
+def register_envs(module: ModuleType) -> None:
+    """Add the environments of a native module of your own, and register them as `EndlessGym/ID`.
+
+    Afterwards all of `endless_gym` plays them in this process. Call it in the package that contains the module, so that
+    `package:ID` finds them in any process. Registering a module again has no effect.
+
+    Args:
+        module: The module that `endless_gym_python::module!` defines in Rust. `endless new` writes a package with one.
+
+    Raises:
+        TypeError: It is not such a module.
+        ValueError: Another module has one of its ids, or it was built for another version of `endless_gym`.
+    """
+    _register(add_specs(module), "EndlessGym")
+
+
+def _register(specs: Iterable[Spec], namespace: str | None) -> None:
+    for spec in specs:
         id = spec.id if namespace is None else f"{namespace}/{spec.id}"
         gymnasium.registry.pop(id, None)
         gymnasium.register(
@@ -27,7 +49,7 @@ def register(namespace: str | None = "EndlessGym") -> None:
             entry_point="endless_gym.registration:single",
             vector_entry_point="endless_gym.registration:vector",
             # Not `id`: `gymnasium.make_vec` and RLlib pass these on to `gymnasium.make`, which has a parameter of that name.
-            kwargs={"env_id": spec.id},
+            kwargs={"env_id": spec.full_id},
             # The environment checks its arguments itself, and the wrappers cost more than its steps.
             disable_env_checker=True,
             order_enforce=False,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.specs import json_text
+from endless_gym.specs import json_text, spec
 
 #: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3).
 View = Literal["agent", "ground_truth"]
@@ -49,7 +49,7 @@ class SnapshotRenderer:
     """Draws environments from their snapshots, in this process, without changing the environments."""
 
     def __init__(self, id: str, view: View) -> None:
-        self._native = _native.Single(json_text({"id": id, "num_envs": 1}))
+        self._native: _native.Single = spec(id).native.Single(json_text({"id": id, "num_envs": 1}))
         # An environment must be reset before it can be restored.
         self._native.reset(0, "{}")
         self._view = view

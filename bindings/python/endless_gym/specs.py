@@ -6,7 +6,8 @@ import difflib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from importlib import import_module
+from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
 import gymnasium
@@ -120,6 +121,20 @@ class Spec:
     #: Reset parameters with their defaults.
     reset_parameters: dict[str, Any]
     render_fps: int
+    #: Name of the native module that plays the environment.
+    module: str = _native.__name__
+
+    @property
+    def native(self) -> ModuleType:
+        """The native module that plays the environment."""
+        return import_module(self.module)
+
+    @property
+    def full_id(self) -> str:
+        """The id with which any process finds the environment: for one of your own `package:id`, otherwise the id."""
+        return (
+            self.id if self.module == _native.__name__ else f"{self.module.rpartition('.')[0] or self.module}:{self.id}"
+        )
 
     def action_space(self) -> gymnasium.Space[Any]:
         """The original's action space."""
@@ -160,6 +175,8 @@ class Spec:
         try:
             if "max_steps" in parameters:
                 return int(parameters["max_steps"])
+            if "explosion_duration" not in self.reset_parameters:
+                return -1
             # Mortar Mayhem: the largest number of commands with the longest durations.
             longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
             clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
@@ -179,29 +196,55 @@ class Spec:
         return spaces.Box(0, 1 if self.frame else np.inf, (self.ground_truth,), np.float32)
 
 
-@cache
+_SPECS: dict[str, Spec] = {}
+
+
 def all_specs() -> dict[str, Spec]:
     """All environments by their ids."""
-    return {described["id"]: described_spec(described) for described in json.loads(_native.specs())}
+    return _SPECS
+
+
+def add_specs(native: ModuleType) -> Iterable[Spec]:
+    """Add the environments of a native module to `all_specs`; `endless_gym.register_envs` documents the errors."""
+    if not hasattr(native, "specs"):
+        raise TypeError(f"module must be a native module that `endless_gym_python::module!` defines, got {native!r}")
+    if native.__version__ != _native.__version__:
+        raise ValueError(
+            f"{native.__name__} was built with endless-gym-python {native.__version__}, which must be the version of "
+            f"endless_gym, {_native.__version__}"
+        )
+    found = [described_spec(described, native.__name__) for described in json.loads(native.specs())]
+    for spec in found:
+        known = _SPECS.get(spec.id, spec)
+        if known.module != spec.module:
+            raise ValueError(f"{spec.module} must not have the id {spec.id}, which {known.module} has already")
+    _SPECS.update((spec.id, spec) for spec in found)
+    return found
 
 
 def spec(id: str) -> Spec:
-    """The specification of an id, with or without the prefix `EndlessGym/`.
+    """The specification of an id, with or without the prefix `EndlessGym/`. As for `gymnasium.make`, `module:id` imports a module
+    first, which registers the id.
 
     Raises:
         TypeError: The id is not a string.
-        ValueError: There is no such id; the message lists all ids.
+        ValueError: The module cannot be imported, or there is no such id; the message lists all ids.
     """
     if not isinstance(id, str):
         raise TypeError(f"id must be a string, got {id!r}")
-    known = all_specs()
-    name = id.removeprefix("EndlessGym/")
-    if name not in known:
-        by_lower = {each.lower(): each for each in known}
+    module, _, name = id.rpartition(":")
+    try:
+        if module:
+            import_module(module)
+    except ImportError as error:
+        raise ValueError(f"id must name a module that can be imported, got {id!r}: {error}") from error
+    name = name.removeprefix("EndlessGym/")
+    if name not in _SPECS:
+        by_lower = {each.lower(): each for each in _SPECS}
         near = difflib.get_close_matches(name.lower(), by_lower, 1)
         hint = f"; did you mean {by_lower[near[0]]}?" if near else ""
-        raise ValueError(f"id must be one of {', '.join(known)}, got {id!r}{hint}")
-    return known[name]
+        raise ValueError(f"id must be one of {', '.join(_SPECS)}, got {id!r}{hint}")
+    return _SPECS[name]
 
 
 def contents(described: Spec, observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
@@ -243,7 +286,7 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"reset parameters must be numbers, booleans, strings or lists, got {value!r}")
 
 
-def described_spec(described: dict[str, Any]) -> Spec:
+def described_spec(described: dict[str, Any], module: str = _native.__name__) -> Spec:
     """The specification that an engine publishes, or that the native module lists."""
     actions = described["action_space"]
     return Spec(
@@ -264,6 +307,7 @@ def described_spec(described: dict[str, Any]) -> Spec:
         feature_columns=_meanings(described["features"]),
         reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
         render_fps=described["render_fps"],
+        module=module,
     )
 
 
@@ -308,3 +352,6 @@ def _observation(described: dict[str, Any], features: NDArray[np.float32]) -> An
 def _meanings(described: Iterable[dict[str, str]]) -> tuple[Meaning, ...]:
     """Entries of the engine's table, with `name` and `description`."""
     return tuple(Meaning(each["name"], each["description"]) for each in described)
+
+
+add_specs(_native)

@@ -19,6 +19,7 @@ from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import Options
 from endless_gym.descriptions import documented, metadata
+from endless_gym.exceptions import TooManyBatchesHeld
 from endless_gym.next_options import NextOptions, RunningEpisode, running_episodes
 from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.reset_requests import ResetRequests, Seeds
@@ -376,10 +377,11 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             RuntimeError: The environments are in another process, or have not been reset.
             ValueError: There is no such environment.
         """
-        if not isinstance(self._backend, _native.Pools):
+        if not hasattr(self._backend, "ground_truth_view"):
             raise RuntimeError("the environments are in another process; make them with `make_vec` for this")
         with self._turns[0]:
-            return self._backend.ground_truth_view(self._env(env))
+            view: NDArray[np.uint8] = self._backend.ground_truth_view(self._env(env))
+        return view
 
     def adopt(self, group: int = 0) -> tuple[Any, dict[str, Any]]:
         """The current observations and info of a group, without starting an episode.
@@ -466,7 +468,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             text = self._before_reset(group, envs, given)
             try:
                 start = self._results.start(self._backend.reset(group, request, text))
-            except (TimeoutError, _native.TooManyBatchesHeld):
+            except (TimeoutError, TooManyBatchesHeld):
                 # `recv` can still return the result.
                 self._sent_reset(group, envs, given, text)
                 raise

@@ -13,6 +13,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.create import specified_results
+from endless_gym.exceptions import EngineLost
 
 
 class WatchedBatch(NamedTuple):
@@ -80,7 +81,7 @@ class Watch:
             raise StopIteration
         try:
             group, step, missed, arrays = self._observer.next(self._timeout)
-        except _native.EngineLost:
+        except EngineLost:
             self.close()
             raise StopIteration from None
         self.missed += missed

@@ -44,6 +44,14 @@ unsafe impl Owner for Lease {
     }
 }
 
+#[pymethods]
+impl Lease {
+    /// See the function of the same name, which may be that of another extension module.
+    fn note_export(&self) {
+        self.0.exported.store(true, Ordering::Relaxed);
+    }
+}
+
 /// The buffers of a pool. A new one is allocated if all are in use.
 #[derive(Default)]
 pub struct Buffers(Vec<Arc<Buffer>>);
@@ -72,18 +80,20 @@ impl Buffers {
 /// Notes that Python code may write to the buffer that `array` is a view of; the pool then draws its frames in full when it next
 /// writes to it. Returns whether `array` is a view of such a buffer.
 #[pyfunction]
-pub fn note_export(array: &Bound<'_, PyUntypedArray>) -> bool {
+pub fn note_export(array: &Bound<'_, PyUntypedArray>) -> PyResult<bool> {
     let py = array.py();
     let mut object = array.clone().into_any();
     loop {
-        if let Ok(lease) = object.cast::<Lease>() {
-            lease.get().0.exported.store(true, Ordering::Relaxed);
-            return true;
-        }
-        let Ok(view) = object.cast_into::<PyUntypedArray>() else { return false };
+        let view = match object.cast_into::<PyUntypedArray>() {
+            Ok(view) => view,
+            Err(other) => {
+                let Some(note) = other.into_inner().getattr_opt("note_export")? else { return Ok(false) };
+                return note.call0().map(|_| true);
+            }
+        };
         // SAFETY: an array's base is an object that the array keeps alive, or null.
         let base = unsafe { Bound::from_borrowed_ptr_or_opt(py, (*view.as_array_ptr()).fields.base) };
-        let Some(base) = base else { return false };
+        let Some(base) = base else { return Ok(false) };
         object = base;
     }
 }

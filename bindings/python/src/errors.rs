@@ -2,22 +2,13 @@
 
 use endless_gym::pool::{PoolError, SnapshotError};
 use endless_gym::service::{Rejection, ServiceError};
-use pyo3::create_exception;
-use pyo3::exceptions::{PyBufferError, PyConnectionError, PyOSError, PyRuntimeError, PyTimeoutError, PyValueError};
+use pyo3::exceptions::{PyConnectionError, PyOSError, PyRuntimeError, PyTimeoutError, PyValueError};
+use pyo3::import_exception;
 use pyo3::prelude::*;
 
-create_exception!(
-    endless_gym,
-    EngineLost,
-    PyConnectionError,
-    "The engine has ended, or has been replaced by another engine."
-);
-create_exception!(
-    endless_gym,
-    TooManyBatchesHeld,
-    PyBufferError,
-    "Arrays of this process hold all batches that the engine can lend."
-);
+// Python defines them, since each extension module with environments would define classes of its own.
+import_exception!(endless_gym, EngineLost);
+import_exception!(endless_gym, TooManyBatchesHeld);
 
 /// The message for environments that have not been reset, in a pool or in an engine.
 const NOT_RESET: &str = "the environments have no episodes yet; reset all of them first";

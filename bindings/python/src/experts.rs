@@ -2,11 +2,12 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use endless_gym::environments;
 use endless_gym::envs::Expert;
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+
+use crate::environments;
 
 /// One scripted expert for each of `num_envs` environments.
 #[pyclass(module = "endless_gym._native")]

@@ -1,6 +1,15 @@
-//! The native module `endless_gym._native`: pools, engines and their batches for Python.
+//! Python extension modules with environments of Endless Gym, which the Python package `endless_gym` plays in process.
 //!
-//! It is a thin layer. The Python package around it defines spaces, infos and Gymnasium's interface.
+//! A crate with environments of its own has a library of the type `cdylib` and depends on this crate without its default features,
+//! one of which defines the package's own module. [`module!`] defines the crate's module, here `_native`:
+//!
+//! ```ignore
+//! endless_gym_python::module!(_native, Registry::new().with::<TMaze>());
+//! ```
+//!
+//! In Python, `endless_gym.register_envs(_native)` adds its ids to those of `endless_gym`. `endless new` writes such a crate.
+//!
+//! The module is a thin layer. The Python package around it defines spaces, infos and Gymnasium's interface.
 
 mod arguments;
 mod arrays;
@@ -15,12 +24,22 @@ mod pool;
 mod single;
 
 use std::ffi::OsString;
+use std::sync::OnceLock;
 
-use endless_gym::pool::Autoreset;
-use endless_gym::{DEFAULT_ENV_ID, environments};
-use pyo3::exceptions::PyRuntimeError;
+use endless_gym::DEFAULT_ENV_ID;
+use endless_gym::pool::{Autoreset, Registry, RegistryError};
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
+
+pub use pyo3;
+
+/// The environments of this module. Every extension module is a shared object, with statics of its own.
+static ENVIRONMENTS: OnceLock<Registry> = OnceLock::new();
+
+fn environments() -> &'static Registry {
+    ENVIRONMENTS.get_or_init(Registry::new)
+}
 
 /// The specifications of all environments, as JSON text.
 #[pyfunction]
@@ -35,8 +54,33 @@ fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) 
     py.detach(|| endless_gym_cli::main(environments(), arguments, &executable))
 }
 
+#[cfg(feature = "native")]
 #[pymodule(name = "_native")]
 fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    populate(module, Ok(endless_gym::environments().clone()))
+}
+
+/// Defines the Python extension module `$name` with the environments of `$registry`, a `Result<Registry, RegistryError>`.
+#[macro_export]
+macro_rules! module {
+    ($name:ident, $registry:expr) => {
+        #[$crate::pyo3::pymodule]
+        #[pyo3(crate = "::endless_gym_python::pyo3")]
+        fn $name(module: &$crate::pyo3::Bound<'_, $crate::pyo3::types::PyModule>) -> $crate::pyo3::PyResult<()> {
+            $crate::populate(module, $registry)
+        }
+    };
+}
+
+/// Adds what `endless_gym` uses to an extension module, with these environments; [`module!`] calls it. The first registry in a
+/// shared object stays.
+///
+/// # Errors
+///
+/// `ValueError` with the message of the [`RegistryError`]; any error of Python.
+pub fn populate(module: &Bound<'_, PyModule>, registry: Result<Registry, RegistryError>) -> PyResult<()> {
+    let registry = registry.map_err(|error| PyValueError::new_err(error.to_string()))?;
+    ENVIRONMENTS.get_or_init(|| registry);
     let py = module.py();
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("AUTORESET_MODES", PyTuple::new(py, Autoreset::ALL.map(Autoreset::name))?)?;
@@ -45,8 +89,6 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("MAX_GROUPS", endless_gym::service::MAX_GROUPS)?;
     module.add("MAX_THREADS", endless_gym::pool::MAX_THREADS)?;
     module.add("MAX_BATCHES_HELD", endless_gym::service::MAX_BATCHES_HELD)?;
-    module.add("EngineLost", py.get_type::<errors::EngineLost>())?;
-    module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
     module.add_class::<experts::Experts>()?;
     module.add_class::<observer::Observer>()?;
     module.add_class::<pool::Pools>()?;

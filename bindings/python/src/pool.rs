@@ -5,7 +5,6 @@
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use endless_gym::batch::Block;
-use endless_gym::environments;
 use endless_gym::pool::{NextOptions, OptionMap, Pool, PoolConfig, PoolError, Threads};
 use endless_gym::service::ServiceError;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
@@ -16,7 +15,7 @@ use pyo3::types::{PyBytes, PyList, PyTuple};
 use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::buffers::Buffers;
 use crate::connection::{Kept, lock};
-use crate::{arrays, errors};
+use crate::{arrays, environments, errors};
 
 /// Checks the configuration of a group, from JSON text, without making environments.
 #[pyfunction]

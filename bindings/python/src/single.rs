@@ -1,7 +1,6 @@
 //! One environment with the interface of the original. Every step returns newly allocated arrays.
 
 use endless_gym::batch::{Batch, BatchSection, Block, zeroed};
-use endless_gym::environments;
 use endless_gym::envs::ActionSpace;
 use endless_gym::envs::view::rgb_array;
 use endless_gym::pool::{OptionMap, Pool, PoolError, ResetRequest, SavedEnv, Threads};
@@ -11,7 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arguments::{self, ActionShape};
-use crate::{arrays, errors};
+use crate::{arrays, environments, errors};
 
 /// Frames, features, vector observation and ground truth; `None` for those that the environment does not have.
 type Arrays<'py> = [Option<Bound<'py, PyAny>>; 4];
