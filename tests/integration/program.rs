@@ -259,6 +259,44 @@ fn errors_of_arguments_are_one_clear_line() {
 }
 
 #[test]
+fn new_writes_a_crate_with_the_given_names_and_changes_nothing_that_exists() {
+    let place = Place::new();
+    let folder = place.root().join("count_down");
+    let new =
+        |arguments: &[&str]| place.endless(&[&["new"], arguments].concat()).current_dir(place.root()).output().unwrap();
+    let written = new(&["count_down", "--path", env!("CARGO_MANIFEST_DIR")]);
+    assert!(written.status.success(), "{}", text(&written.stderr));
+    assert!(text(&written.stdout).contains("play CountDown-v0"));
+    for (file, part) in [
+        ("Cargo.toml", concat!("[patch.crates-io]\nendless-gym = { path = \"", env!("CARGO_MANIFEST_DIR"), "\" }")),
+        ("Cargo.toml", concat!("endless-gym = \"=", env!("CARGO_PKG_VERSION"), "\"")),
+        ("pyproject.toml", concat!("endless-gym==", env!("CARGO_PKG_VERSION"))),
+        ("python/count_down/__init__.py", "from count_down import _native"),
+        ("src/task.rs", "EnvSpec::new(\"CountDown-v0\""),
+        ("src/main.rs", "count_down::registry()"),
+        ("example.py", "count_down:CountDown-v0"),
+        ("README.md", "endless-train --env count_down:CountDown-v0"),
+    ] {
+        let text = std::fs::read_to_string(folder.join(file)).unwrap();
+        assert!(text.contains(part), "{file}: {text}");
+        assert!(!["t_maze", "TMaze", "VERSION"].iter().any(|left| text.contains(left)), "{file}: {text}");
+    }
+    let manifest = std::fs::read(folder.join("Cargo.toml")).unwrap();
+    for (arguments, part) in [
+        (&["count_down"] as &[_], "`count_down` exists already"),
+        (&["mystery_path"], "MysteryPath-v0"),
+        (&["../maze"], "got `../maze`"),
+        (&["maze", "--path", "/"], "--path must be a checkout of Endless Gym, got `/`"),
+    ] {
+        let refused = new(arguments);
+        assert_eq!(refused.status.code(), Some(1), "{arguments:?}");
+        assert!(text(&refused.stderr).contains(part), "{}", text(&refused.stderr));
+    }
+    assert_eq!(std::fs::read(folder.join("Cargo.toml")).unwrap(), manifest);
+    assert!(!place.root().join("maze").exists() && !place.root().join("mystery_path").exists());
+}
+
+#[test]
 fn bench_measures_every_method() {
     let place = Place::new();
     let output = place.run(&["bench", "--num-envs", "16", "--seconds", "0.05", "--rounds", "1", "--json"]);

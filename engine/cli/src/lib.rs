@@ -14,6 +14,7 @@ mod huge_pages;
 mod list;
 mod logs;
 mod metrics;
+mod new;
 mod open;
 mod options;
 mod output;
@@ -81,6 +82,8 @@ enum Command {
     Verify(verify::Args),
     /// Check environments with random actions: seeds, snapshots, frames, spaces, limits of reset parameters.
     Check(check::Args),
+    /// Write a crate with an environment of your own: its task, its tests, its program and its Python package.
+    New(new::Args),
     /// Write the raw frames of an expert's episode to standard output.
     #[command(hide = true)]
     Frames(frames::Args),
@@ -165,6 +168,7 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::Play(args) => play_command::run(registry, &args)?,
         Command::Record(args) => record::run(registry, &args)?,
         Command::Bench(args) => bench::run(registry, &args)?,
+        Command::New(args) => new::run(registry, &args)?,
         Command::Frames(args) => frames::run(registry, &args)?,
         Command::Verify(args) => return verify::run(registry, &args),
         Command::Check(args) => return check::run(registry, &args),

@@ -1,0 +1,14 @@
+//! Environments for Endless Gym: a library, a program and a Python package.
+
+mod task;
+
+use endless_gym::pool::{Registry, RegistryError};
+pub use task::TMaze;
+
+/// The environments of this crate; `with` adds each further task.
+pub fn registry() -> Result<Registry, RegistryError> {
+    Registry::new().with::<TMaze>()
+}
+
+#[cfg(feature = "python")]
+endless_gym_python::module!(_native, registry());

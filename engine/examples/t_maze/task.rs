@@ -1,0 +1,1 @@
+../../cli/template/src/task.rs
