@@ -57,7 +57,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return f"```{Path(found[1]).suffix[1:]}\n{(ROOT / found[1]).read_text()}```"
 
     # A link that forms a paragraph by itself is replaced by the file's contents.
-    markdown = re.sub(r"^\[([\w/.-]+\.(?:rs|yaml|sh))\]\([^)]*\)$", contents, markdown, flags=re.M)
+    markdown = re.sub(r"^\[([\w/.-]+\.(?:rs|py|yaml|sh))\]\([^)]*\)$", contents, markdown, flags=re.M)
     markdown = re.sub(r"(?<!!)\[([^\]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)", link, markdown)
     if os.environ.get("ENDLESS_DOCS_PAGE"):
         markdown = markdown.replace("<!-- play -->", '<a href="play/index.html">Play in the browser</a>')
