@@ -38,12 +38,11 @@ def start(folder: Path, out: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def completed(folder: Path, out: str) -> str:
-    """The output of the command that completes the remaining work."""
-    process = start(folder, out)
-    text, _ = process.communicate(timeout=280)
-    assert process.returncode == 0, text
-    return text
+def completed(folder: Path, out: str, capfd: pytest.CaptureFixture[str]) -> str:
+    """The output of the command, run in this process, that completes the remaining work."""
+    given = ReproduceArguments((str(folder / "mine.json"),), out=folder / out, jobs=1, device="cpu", nice=0)
+    execute(given)
+    return capfd.readouterr().out
 
 
 def run_folder(folder: Path, out: str) -> Path:
@@ -236,40 +235,33 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed[NAMES.index("endless")]["runs"][0]["updates"] == 50_000
 
 
-@pytest.fixture(scope="module")
-def through(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an undisturbed run in its subfolder `through`."""
-    folder = tmp_path_factory.mktemp("reproduced")
-    own(folder)
-    completed(folder, "through")
-    assert (folder / "through" / "mine" / "README.md").exists()
-    return folder
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["kill", "interrupt"])
-def test_stopped_run_equals_an_uninterrupted_one(how: str, through: Path, tmp_path: Path) -> None:
-    """A run that was killed or stopped by Ctrl-C is completed; repeating the command then runs nothing."""
+def test_stopped_run_equals_an_uninterrupted_one(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A run that was killed, and then stopped by Ctrl-C, is completed; repeating the command then runs nothing."""
     own(tmp_path)
-    begun, run = start(tmp_path, "stopped"), run_folder(tmp_path, "stopped")
-    wait_for_updates(run, 3)
-    if how == "kill":
-        (child,) = psutil.Process(begun.pid).children()
-        child.kill()
-    else:
-        begun.send_signal(signal.SIGINT)
-    text, _ = begun.communicate(timeout=280)
-    assert begun.returncode == (1 if how == "kill" else 130), text
-    assert 2 <= checkpoint.load(run).update < 6
-    assert "resumed at update" in completed(tmp_path, "stopped")
-    expected = run_folder(through, "through")
+    run = run_folder(tmp_path, "stopped")
+    for how, update in (("kill", 2), ("interrupt", 4)):
+        begun = start(tmp_path, "stopped")
+        wait_for_updates(run, update)
+        if how == "kill":
+            (child,) = psutil.Process(begun.pid).children()
+            child.kill()
+        else:
+            begun.send_signal(signal.SIGINT)
+        text, _ = begun.communicate(timeout=280)
+        assert begun.returncode == (1 if how == "kill" else 130), text
+    assert 4 <= checkpoint.load(run).update < 6
+    assert "resumed at update" in completed(tmp_path, "stopped", capfd)
+    completed(tmp_path, "through", capfd)
+    assert (tmp_path / "through" / "mine" / "README.md").exists()
+    expected = run_folder(tmp_path, "through")
     assert len(progress(run)) == 6
     assert progress(run) == progress(expected)
     assert same(*(checkpoint.load(each).state["model"] for each in (run, expected)))
-    tables = [folder / "mine" / "table.csv" for folder in (tmp_path / "stopped", through / "through")]
+    tables = [tmp_path / out / "mine" / "table.csv" for out in ("stopped", "through")]
     assert tables[0].read_text() == tables[1].read_text()
     before = os.stat(run / "progress.jsonl").st_mtime_ns
-    text = completed(tmp_path, "stopped")
+    text = completed(tmp_path, "stopped", capfd)
     assert "1 of 1 jobs done" in text
     assert "started" not in text
     assert "resumed" not in text

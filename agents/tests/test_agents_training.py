@@ -123,8 +123,7 @@ def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["thread", "process"])
-@pytest.mark.parametrize("number", STOP_SIGNALS)
+@pytest.mark.parametrize(("number", "engine"), [*zip(STOP_SIGNALS, ["process", "thread", "process"], strict=True)])
 def test_a_signal_writes_a_checkpoint_and_frees_shared_memory(
     number: signal.Signals, engine: str, tmp_path: Path, segments: Callable[[], set[str]]
 ) -> None:

@@ -101,8 +101,7 @@ def start() -> Iterator[Start]:
 @pytest.mark.parametrize(
     ("agent", "ranks", "arguments"),
     [
-        ("gru", 2, "--ppo.advantage-normalisation minibatch --environment.engine process"),
-        ("lstm", 4, "--ppo.advantage-normalisation none --environment.groups 1"),
+        ("lstm", 4, "--ppo.advantage-normalisation minibatch --environment.engine process --environment.groups 1"),
         # Each minibatch has one sequence, which belongs to one rank; the other rank has no steps.
         ("trxl", 2, "--environment.num-envs 2 --environment.groups 1 --transformer.sequence-length 16"),
     ],

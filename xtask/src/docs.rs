@@ -14,7 +14,8 @@ pub fn build(write: bool) -> Result<(), String> {
     let mut generate = Command::new(folder.join("bin/python"));
     generate.arg("docs/generate.py").args((!write).then_some("--check")).current_dir(workspace());
     let list = target()?.join("environments.json");
-    fs::write(&list, environments()?).map_err(describe(&list))?;
+    let mut environments = cargo(&["run", "--quiet", "--locked", "--bin", "endless", "--", "list", "--json"]);
+    fs::write(&list, output(&mut environments)?).map_err(describe(&list))?;
     run(generate.stdin(fs::File::open(&list).map_err(describe(&list))?))?;
 
     let page = web::Toolchain::find().is_some();
@@ -30,23 +31,15 @@ pub fn build(write: bool) -> Result<(), String> {
     // Silences an announcement of Material for MkDocs.
     mkdocs.env("NO_MKDOCS_2_WARNING", "1");
     if page {
-        mkdocs.env("ENDLESS_DOCS_PAGE", "1");
-    }
-    output(&mut mkdocs)?;
-
-    if page {
+        output(mkdocs.env("ENDLESS_DOCS_PAGE", "1"))?;
         copy(&web::folder()?, &site.join("play"))?;
+    } else {
+        output(&mut mkdocs)?;
     }
-
     run(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;
     copy(&target()?.join("doc"), &site.join("rust"))?;
     println!("{}", site.join("index.html").display());
     Ok(())
-}
-
-/// The table of environments, as `endless list --json` prints it.
-fn environments() -> Result<String, String> {
-    output(&mut cargo(&["run", "--quiet", "--locked", "--bin", "endless", "--", "list", "--json"]))
 }
 
 /// Copies a folder with everything in it.

@@ -102,7 +102,7 @@ fn main() -> ExitCode {
         Task::Bench { arguments } => python::bench(&arguments),
         Task::Faults { arguments } => rust::faults("faults", &arguments),
         Task::Soak { arguments } => rust::faults("soak", &arguments),
-        Task::Live { steps } => rust::live(steps),
+        Task::Live { steps } => rust::test_original(Some(steps)),
         Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), minutes),
         Task::Original => python::original().map(|python| println!("{}", python.display())),
     };

@@ -5,13 +5,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::shell::{
-    cargo, cargo_home, describe, files_below, output, recreate, remap, run, sysroot, target, workspace,
-};
+use crate::shell::{cargo, cargo_home, describe, files_below, recreate, remap, run, sysroot, target, workspace};
 use crate::{python, web};
 
-/// Maturin as in the tests, and a tool that unpacks wheels. Zig links against any version of the C library.
-const TOOLS: [&str; 3] = ["maturin==1.16.0", "wheel==0.48.0", "ziglang==0.17.1"];
+/// Maturin as in the tests. Zig links against any version of the C library.
+const TOOLS: [&str; 2] = ["maturin==1.16.0", "ziglang==0.17.1"];
 
 /// The oldest C library that the wheel supports; maturin fails if a symbol is newer.
 const PLATFORM: &str = "manylinux_2_17";
@@ -87,23 +85,12 @@ fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
     maturin.arg("--target-dir").arg(target()?).arg("--out").arg(&built);
     run(maturin.env("CARGO_ENCODED_RUSTFLAGS", remap(source)?))?;
 
-    // The bill of materials contains the paths of the local crates, so replace them. `wheel pack` updates the
-    // checksums.
-    let wheel = |task: &[&str]| {
-        let mut wheel = Command::new(tools.join("bin/wheel"));
-        wheel.args(task);
-        wheel
-    };
-    let built_wheel = only_file(&built, ".whl")?;
-    run(wheel(&["unpack", "--dest"]).arg(&built).arg(&built_wheel))?;
-    let name = built_wheel.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let unpacked = built.join(name.splitn(3, '-').take(2).collect::<Vec<_>>().join("-"));
-    for file in files_below(&unpacked)?.iter().filter(|file| file.to_string_lossy().ends_with(".cyclonedx.json")) {
-        let text = fs::read_to_string(file).map_err(describe(file))?;
-        fs::write(file, text.replace(&source.display().to_string(), "/endless-gym")).map_err(describe(file))?;
-    }
+    let unpacked = built.join("unpacked");
+    let wheel = only_file(&built, ".whl")?;
+    run(Command::new(tools.join("bin/python")).args(["-m", "zipfile", "-e"]).arg(&wheel).arg(&unpacked))?;
     check_contents(&unpacked)?;
-    run(wheel(&["pack", "--dest-dir"]).arg(folder).arg(&unpacked))
+    let name = wheel.file_name().unwrap_or_default();
+    fs::copy(&wheel, folder.join(name)).map(drop).map_err(describe(&wheel))
 }
 
 /// Fails if a licence is missing, or if a file contains a path of this machine.
@@ -124,43 +111,43 @@ fn check_contents(wheel: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// Packages the crates, and builds each from its package with the packages of the others.
+/// Packages the crates, and builds the facade and its dependencies from the packages, which shows that they are complete.
 fn crates(folder: &Path) -> Result<(), String> {
-    let version = env!("CARGO_PKG_VERSION");
-    let build = target()?.join("packaged");
-    remove_earlier(&build)?;
-    let mut package = cargo(&["package", "--locked", "--allow-dirty", "--target-dir"]);
-    package.arg(&build).args(CRATES.map(|name| format!("--package={name}")));
-    // The workspace's profiles do not apply here.
-    run(package.env("CARGO_PROFILE_DEV_DEBUG", "false"))?;
+    let build = target()?;
+    let packages = CRATES.map(|name| format!("--package={name}"));
+    run(cargo(&["package", "--locked", "--allow-dirty", "--no-verify", "--quiet"]).args(packages))?;
+    let unpacked = build.join("packaged");
+    recreate(&unpacked)?;
+    let mut patches = String::from("[patch.crates-io]\n");
     for name in CRATES {
-        let package = build.join(format!("package/{name}-{version}.crate"));
-        let list = output(Command::new("tar").args(["--list", "--file"]).arg(&package))?;
-        if let Some(missing) = LICENCES.iter().find(|licence| !list.contains(&format!("/{licence}\n"))) {
-            return Err(format!("the package of {name} must contain {missing}, got\n{list}"));
+        let file = format!("{name}-{}.crate", env!("CARGO_PKG_VERSION"));
+        let package = build.join("package").join(&file);
+        // As of the source distribution, the times in the archive are fixed.
+        run(Command::new("tar")
+            .args(["--extract", "--touch", "--file"])
+            .arg(&package)
+            .arg("--directory")
+            .arg(&unpacked))?;
+        let source = unpacked.join(file.trim_end_matches(".crate"));
+        if let Some(missing) = LICENCES.iter().find(|licence| !source.join(licence).exists()) {
+            return Err(format!("the package of {name} must contain {missing}"));
         }
-        fs::copy(&package, folder.join(format!("{name}-{version}.crate"))).map_err(describe(&package))?;
+        patches += &format!("{name}.path = {:?}\n", source.display().to_string());
+        fs::copy(&package, folder.join(&file)).map_err(describe(&package))?;
     }
+    // Without the workspace, in the tests' profile and folder, for which the dependencies are compiled already.
+    let config = unpacked.join("patches.toml");
+    fs::write(&config, patches).map_err(describe(&config))?;
+    let in_package = |task: &[&str], name: &str| {
+        let mut cargo = cargo(task);
+        cargo.arg("--config").arg(&config).arg("--manifest-path");
+        cargo.arg(unpacked.join(format!("{name}-{}/Cargo.toml", env!("CARGO_PKG_VERSION"))));
+        cargo.env("CARGO_PROFILE_DEV_DEBUG", "false").env("CARGO_TARGET_DIR", &build);
+        cargo
+    };
+    run(&mut in_package(&["build"], "endless-gym"))?;
     // The tests of the core read recorded cases, which its package must contain.
-    let mut check = cargo(&["check", "--quiet", "--tests", "--manifest-path"]);
-    check.arg(build.join(format!("package/endless-gym-core-{version}/Cargo.toml"))).arg("--target-dir").arg(&build);
-    run(check.env("CARGO_PROFILE_DEV_DEBUG", "false"))
-}
-
-/// Removes what earlier runs unpacked and built of these crates. Cargo packages a workspace through a temporary
-/// registry in the target directory, and assumes that a registry's crates never change within a version.
-fn remove_earlier(build: &Path) -> Result<(), String> {
-    // Only this registry's folder starts with `-`; those of other registries start with their host.
-    let mut parents = folders(&cargo_home()?.join("registry/src"), "-");
-    parents.push(build.join("debug/.fingerprint"));
-    let earlier = parents.iter().flat_map(|parent| folders(parent, "endless-gym"));
-    earlier.into_iter().try_for_each(|folder| fs::remove_dir_all(&folder).map_err(describe(&folder)))
-}
-
-/// The folders in a folder whose names begin with `prefix`; none if there is no such folder.
-fn folders(parent: &Path, prefix: &str) -> Vec<PathBuf> {
-    let entries = fs::read_dir(parent).into_iter().flatten().flatten();
-    entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix)).map(|entry| entry.path()).collect()
+    run(&mut in_package(&["check", "--tests"], "endless-gym-core"))
 }
 
 /// Maturin with a path on which it finds zig's Python first.

@@ -56,19 +56,16 @@ fn not_run(what: &str) -> Result<(), String> {
     if std::env::var("CI").as_deref() == Ok("true") { Err(format!("not run, {what}")) } else { Ok(()) }
 }
 
-/// Compares with the original, with a fixed seed.
-pub fn test_original() -> Result<(), String> {
-    let mut cargo = shell::cargo(&["test", "--locked", "--test", "integration", "--", "--ignored", "live::"]);
-    cargo.env("ENDLESS_POPGYM_PYTHON", python::popgym()?);
-    run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("PROPTEST_RNG_SEED", PROPERTY_SEED))
-}
-
-/// Compares `steps` steps of each environment with the original, with new seeds; optimised, since it takes long.
-pub fn live(steps: u64) -> Result<(), String> {
-    let tests = ["test", "--release", "--locked", "--test", "integration", "--", "--ignored", "--nocapture", "live::"];
-    let mut cargo = shell::cargo(&tests);
-    cargo.env("ENDLESS_POPGYM_PYTHON", python::popgym()?);
-    run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("ENDLESS_LIVE_STEPS", steps.to_string()))
+/// Compares with the original: with a fixed seed, or `steps` steps of each environment with new seeds, optimised, since
+/// they take long.
+pub fn test_original(steps: Option<u64>) -> Result<(), String> {
+    let mut cargo = shell::cargo(&["test", "--locked", "--test", "integration"]);
+    match steps {
+        Some(steps) => cargo.arg("--release").env("ENDLESS_LIVE_STEPS", steps.to_string()),
+        None => cargo.env("PROPTEST_RNG_SEED", PROPERTY_SEED),
+    };
+    cargo.env("ENDLESS_POPGYM_PYTHON", python::popgym()?).env("ENDLESS_ORIGINAL_PYTHON", python::original()?);
+    run(cargo.args(["--", "--ignored", "--nocapture", "live::"]))
 }
 
 /// Runs one or all fuzz targets with new seeds for at least `minutes`; optimised, since it takes long.
@@ -96,7 +93,7 @@ pub fn loom() -> Result<(), String> {
 
 /// Runs the fault injection with a fixed seed. A failure prints the command line that repeats it.
 pub fn test_faults() -> Result<(), String> {
-    faults("faults", &["--minutes", "2", "--seed", "1"].map(str::to_owned))
+    faults("faults", &["--minutes", "1", "--seed", "1"].map(str::to_owned))
 }
 
 /// Builds the program of `tests/faults` and the engine that it starts, and runs one of the program's commands.
@@ -105,7 +102,7 @@ pub fn faults(command: &str, arguments: &[String]) -> Result<(), String> {
     run(Command::new(target()?.join("debug/endless-gym-faults")).arg(command).args(arguments))
 }
 
-/// Environment steps that `benches/instructions.rs` counts.
+/// Environment steps that the benchmark counts.
 const STEPS: u64 = 250 * 16;
 
 /// Allowed deviation, since other CPUs copy memory with other instructions.
@@ -114,14 +111,19 @@ const MARGIN_PERCENT: u64 = 10;
 /// Counts the instructions of a step, which do not depend on the machine's load, and compares them with the budgets;
 /// with `record`, writes the counts as the new budgets.
 pub fn instructions(record: bool) -> Result<(), String> {
-    let file = workspace().join("benches/instructions.txt");
+    let file = workspace().join("engine/memory-gym/benches/instructions.txt");
     let text = std::fs::read_to_string(&file).map_err(describe(&file))?;
+    let lines: Vec<_> = text.lines().map(|line| line.split_once(' ').unwrap_or((line, "0"))).collect();
+    // Callgrind uses one core.
+    let counts: Vec<Result<u64, String>> = std::thread::scope(|scope| {
+        let counting: Vec<_> = lines.iter().map(|(id, _)| scope.spawn(|| count(id))).collect();
+        counting.into_iter().map(|count| count.join().map_err(|_| "a count panicked".to_owned()).flatten()).collect()
+    });
     let (mut recorded, mut failures) = (String::new(), Vec::new());
     println!("{:30} {:>24} {:>8}", "environment", "instructions a step", "budget");
-    for line in text.lines() {
-        let (id, budget) = line.split_once(' ').unwrap_or((line, "0"));
+    for ((id, budget), count) in lines.into_iter().zip(counts) {
         let budget: u64 = budget.parse().map_err(describe(&file))?;
-        let count = count(id)? / STEPS;
+        let count = count? / STEPS;
         println!("{id:30} {count:24} {budget:8}");
         recorded += &format!("{id} {count}\n");
         if count.abs_diff(budget) * 100 > budget * MARGIN_PERCENT {
@@ -140,14 +142,21 @@ pub fn instructions(record: bool) -> Result<(), String> {
 
 /// Instructions of all counted steps of an environment, measured by callgrind.
 fn count(id: &str) -> Result<u64, String> {
-    const VALGRIND: &str =
-        "valgrind --tool=callgrind --callgrind-out-file=/dev/null --log-fd=1 --toggle-collect=instructions::steps";
+    const VALGRIND: &str = "valgrind --tool=callgrind --callgrind-out-file=/dev/null --log-fd=1 --toggle-collect=instructions::counted_steps";
     // Keep the C library from using `rep movsb` and `rep stosb`, since callgrind counts each of their bytes as an
     // instruction.
     const TUNABLES: &str = "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000";
     let runner = format!("CARGO_TARGET_{}_RUNNER", env!("TARGET").to_uppercase().replace('-', "_"));
-    let mut bench =
-        shell::cargo(&["bench", "--locked", "--package", "endless-gym", "--bench", "instructions", "--", id]);
+    let mut bench = shell::cargo(&[
+        "bench",
+        "--locked",
+        "--package",
+        "endless-gym-memory-gym",
+        "--bench",
+        "instructions",
+        "--",
+        id,
+    ]);
     let printed = output(bench.env(runner, VALGRIND).env("GLIBC_TUNABLES", TUNABLES))?;
     let collected = printed.lines().find_map(|line| Some(line.split_once("Collected :")?.1.trim()));
     let count = collected.and_then(|count| count.parse().ok()).filter(|count| *count > 0);

@@ -70,11 +70,6 @@ impl Toolchain {
     }
 }
 
-/// Builds the environments and the core, without threads and without the system's entropy.
-pub fn build_core() -> Result<(), String> {
-    Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-memory-gym"]).map(drop)
-}
-
 /// Whether there is a Chromium for the tests.
 pub fn has_browser() -> bool {
     let given = std::env::var("CHROMIUM").into_iter();

@@ -23,13 +23,16 @@ pub struct Picture {
 impl Picture {
     /// The pixels of a canvas, each magnified to a square with side `scale`.
     fn from_columns(pixels: &[Rgb], FrameShape { width, height, .. }: FrameShape, scale: usize) -> Self {
-        let mut picture = Vec::with_capacity(pixels.len() * 3 * scale * scale);
-        for row in 0..height * scale {
+        let stride = width * scale;
+        let mut picture = vec![Rgb::default(); stride * height * scale];
+        for y in 0..height {
+            let row = y * scale * stride;
             for x in 0..width {
-                picture.extend_from_slice(pixels[x * height + row / scale].repeat(scale).as_slice());
+                picture[row + x * scale..][..scale].fill(pixels[x * height + y]);
             }
+            (1..scale).for_each(|below| picture.copy_within(row..row + stride, row + below * stride));
         }
-        Picture { width: width * scale, height: height * scale, pixels: picture }
+        Picture { width: stride, height: height * scale, pixels: picture.into_flattened() }
     }
 }
 
