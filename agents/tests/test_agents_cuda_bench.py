@@ -39,6 +39,7 @@ def test_parts_that_need_no_gpu_run_on_the_cpu(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+@pytest.mark.slow
 def test_without_cuda_it_fails_with_a_message() -> None:
     done = run()
     assert (done.returncode, done.stdout) == (1, "")

@@ -33,7 +33,10 @@ def small(agent: str, run: Path, **ppo: Any) -> Settings:
     return changed(given, environment=environment, ppo={"steps": 16, "minibatches": 2, "updates": 3} | ppo)
 
 
-@pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
+OTHERS = ("none", "position", "stack", "lstm", "gtrxl")
+
+
+@pytest.mark.parametrize("agent", ["gru", "trxl", *(pytest.param(agent, marks=pytest.mark.slow) for agent in OTHERS)])
 def test_a_run_that_diverges_stops_and_keeps_its_last_healthy_checkpoint(
     agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -69,7 +72,9 @@ def test_weights_that_are_not_finite_are_refused(
         assert "not finite" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("number", STOP_SIGNALS)
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(each, marks=pytest.mark.slow) for each in (signal.SIGINT, signal.SIGHUP))]
+)
 def test_a_signal_stops_a_run_after_its_update_with_a_checkpoint(number: signal.Signals, tmp_path: Path) -> None:
     before = [signal.getsignal(each) for each in STOP_SIGNALS]
     for attempt in range(3):

@@ -142,7 +142,7 @@ def test_forward_does_not_leak(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TRANSFORMERS)
-@pytest.mark.parametrize("recording", [True, False])
+@pytest.mark.parametrize("recording", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_kv_cache_equals_a_loop_over_windows(name: str, recording: bool) -> None:
     """Transformer-XL against a plain loop that projects the window of each step and environment separately."""
     agent = agent_of(name)
@@ -260,6 +260,7 @@ def test_kv_cache_is_recomputed_when_a_segment_begins() -> None:
     assert_close(output.value, value.flatten()[minibatch.indices])
 
 
+@pytest.mark.slow
 def test_compiled_agent_has_the_same_outputs() -> None:
     agent, observed, done = make("trxl"), observations(STEPS, ENVS), ends(STEPS, ENVS)
     _, action, _, value = play(agent, agent.initial_memory(ENVS), observed, done)

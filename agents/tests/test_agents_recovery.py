@@ -67,13 +67,10 @@ def compare(run: Path, other: Path) -> None:
 
 #: Each update has 32 calls of `send` and `receive`, 16 for each of two groups.
 PLACES = [
-    ("send", 1),
-    ("receive", 1),
-    ("send", 32 * UPDATES),
+    *(pytest.param(*place, marks=pytest.mark.slow) for place in (("send", 1), ("receive", 1), ("send", 32 * UPDATES))),
     ("receive", 32 * UPDATES),
     ("mark", UPDATES),
-    ("learn", UPDATES),
-    ("snapshots", 2),
+    *(pytest.param(*place, marks=pytest.mark.slow) for place in (("learn", UPDATES), ("snapshots", 2))),
 ]
 
 
@@ -95,6 +92,7 @@ def test_a_run_whose_engine_is_killed_equals_an_undisturbed_run(
     assert re.search(r"a new engine process continues the update, after \d+ steps that were played again", output)
 
 
+@pytest.mark.slow
 def test_restarts_are_counted_per_update(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kill_before(monkeypatch, "receive", {3, 17, 40, 41, 60, 90, 127})
     compare(train(small("gru", tmp_path / "run", UPDATES, engine="process")), undisturbed)
