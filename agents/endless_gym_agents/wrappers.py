@@ -145,9 +145,10 @@ class WrappedGroups:
         return [wrapper for wrapper in _layers(self._wrapped[group]) if hasattr(wrapper, "state_dict")]
 
     def close(self) -> None:
-        """Close the environments."""
+        """Close the environments, and drop all arrays, which would keep shared memory."""
         for envs in self._wrapped:
             envs.close()
+        self._groups, self._wrapped, self._observations = [], [], []
 
 
 def wrap(settings: Settings, envs: VectorEnv[Any, Any, Any]) -> Any:

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import torch
-from agents_helpers import changed, collecting, settings
+from agents_helpers import changed, collecting, saved, settings
 
-from endless_gym_agents import checkpoint, enjoy, protocol
+from endless_gym_agents import checkpoint, enjoy, probe, protocol, record
 from endless_gym_agents import train as training
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.evaluate import evaluate
@@ -198,6 +198,20 @@ def test_a_resumed_run_with_a_wrapper_equals_an_undisturbed_one(
     assert max(episode["reward"] for episode in evaluate(resumed.agent, range(2), 1)) <= 1.0
     with pytest.raises(ValueError, match="a resumed run must keep its environment"):
         training.train(changed(given, resume=str(part), environment={"wrapper": ()}))
+
+
+def test_films_probes_and_data_sets_know_the_wrapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An agent of wrapped observations cannot act without the wrapper."""
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN)
+    given = settings("gru", env="Endless-MysteryPath-v0", environment={"wrapper": ("own.py:Counting",)}).validated()
+    agent = saved(Path("run"), given)
+    monkeypatch.chdir("/")
+    assert agent.observation_shapes["time"] == (1,)
+    assert len(probe.record(agent, range(2), max_steps=4).truth) == 8
+    assert len(list(enjoy.EpisodeRecorder(agent, max_steps=3).frames((5,)))) > 4
+    with pytest.raises(ValueError, match="trained with --environment.wrapper .*own.py:Counting"):
+        record.execute(record.RecordArguments(tmp_path / "run", episodes=1, root=tmp_path))
 
 
 def test_the_agent_learns_from_the_wrapped_rewards(tmp_path: Path) -> None:

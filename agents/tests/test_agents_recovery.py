@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agents_helpers import changed
 from test_agents_training import GRID, progress, same, small
 
 import endless_gym_agents.train as train_module
@@ -96,6 +97,36 @@ def test_a_run_whose_engine_is_killed_equals_an_undisturbed_run(
 def test_restarts_are_counted_per_update(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kill_before(monkeypatch, "receive", {3, 17, 40, 41, 60, 90, 127})
     compare(train(small("gru", tmp_path / "run", UPDATES, engine="process")), undisturbed)
+
+
+WRAPPER = """
+from gymnasium.vector import VectorRewardWrapper
+
+class Growing(VectorRewardWrapper):
+    calls = 0
+
+    def rewards(self, rewards):
+        self.calls += 1
+        return rewards + 0.001 * self.calls
+
+    def state_dict(self):
+        return {"calls": self.calls}
+
+    def load_state_dict(self, state):
+        self.calls = state["calls"]
+"""
+
+
+def test_a_wrapper_does_not_notice_that_the_engine_was_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "growing.py").write_text(WRAPPER)
+    wrapper = {"wrapper": (f"{tmp_path}/growing.py:Growing",)}
+    one, two = (changed(small("gru", tmp_path / name, 2, engine="process"), environment=wrapper) for name in "ab")
+    undisturbed = train(one)
+    kill_before(monkeypatch, "receive", {37})
+    compare(train(two), undisturbed)
+    assert "a new engine process continues the update, after " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("policy", ["restart", "save"])
