@@ -44,6 +44,9 @@ KINDS = {
     "gtrxl": ("gtrxl", transformer(gate_bias=2.0)),
 }
 TRANSFORMERS = [name for name in KINDS if "trxl" in name]
+#: Those whose longest test is not slow.
+FAST = ["trxl", "trxl, relative", "trxl, single steps", "gtrxl, learned, previous"]
+OTHERS = [name for name in TRANSFORMERS if name not in FAST]
 WITH_STATE = [name for name in KINDS if name not in ("none", "position")]
 
 
@@ -141,7 +144,7 @@ def test_forward_does_not_leak(name: str) -> None:
         assert reached == {(t, 1) for t in range(max(10, 15 - 15 % length), 16)}
 
 
-@pytest.mark.parametrize("name", TRANSFORMERS)
+@pytest.mark.parametrize("name", FAST + [pytest.param(name, marks=pytest.mark.slow) for name in OTHERS])
 @pytest.mark.parametrize("recording", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_kv_cache_equals_a_loop_over_windows(name: str, recording: bool) -> None:
     """Transformer-XL against a plain loop that projects the window of each step and environment separately."""

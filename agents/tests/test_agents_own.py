@@ -210,7 +210,7 @@ def test_films_probes_and_data_sets_know_the_wrapper(tmp_path: Path, monkeypatch
     assert agent.observation_shapes["time"] == (1,)
     assert len(probe.record(agent, range(2), max_steps=4).truth) == 8
     assert len(list(enjoy.EpisodeRecorder(agent, max_steps=3).frames((5,)))) > 4
-    with pytest.raises(ValueError, match="trained with --environment.wrapper .*own.py:Counting"):
+    with pytest.raises(ValueError, match=r"trained with --environment.wrapper .*own.py:Counting"):
         record.execute(record.RecordArguments(tmp_path / "run", episodes=1, root=tmp_path))
 
 
