@@ -15,7 +15,7 @@ const TOOLS: [&str; 2] = ["maturin==1.16.0", "ziglang==0.17.1"];
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, dependencies first.
-const CRATES: [&str; 8] = [
+const CRATES: [&str; 9] = [
     "endless-gym-core",
     "endless-gym-memory-gym",
     "endless-gym-popgym",
@@ -24,6 +24,7 @@ const CRATES: [&str; 8] = [
     "endless-gym-view",
     "endless-gym-cli",
     "endless-gym",
+    "endless-gym-python",
 ];
 
 const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
