@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from types import ModuleType
 
 import gymnasium
@@ -72,3 +73,9 @@ def test_a_module_of_another_version_or_kind_is_refused(package):
 def test_exceptions_of_engines_are_those_of_the_package():
     assert endless_gym.EngineLost.__module__ == endless_gym.TooManyBatchesHeld.__module__ == "endless_gym"
     assert not hasattr(_native, "EngineLost")
+
+
+def test_an_environment_without_the_parameter_max_steps_has_no_known_limit():
+    found = endless_gym.spec("MysteryPath-v0")
+    assert found.max_episode_steps({"max_steps": 7}) == 7
+    assert replace(found, reset_parameters={"width": 3}).max_episode_steps({}) == -1
