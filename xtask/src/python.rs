@@ -59,6 +59,10 @@ pub fn uv(arguments: &[&str]) -> Result<Command, String> {
     Ok(uv)
 }
 
+fn python_of(environment: &Path) -> PathBuf {
+    environment.join("bin/python")
+}
+
 fn venv_folder(name: &str) -> Result<PathBuf, String> {
     Ok(target()?.join("venvs").join(name))
 }
@@ -183,8 +187,9 @@ pub fn test() -> Result<(), String> {
     pytest(&environment, "bindings/python", "not slow and not libraries and not original", &[])
 }
 
-/// Runs the tests of the environments' package that take long or need third-party libraries.
-pub fn test_libraries() -> Result<(), String> {
+/// Runs the tests of the environments' package that take long or need third-party libraries. Crates of users are built with
+/// the packages in the folder `crates`.
+pub fn test_libraries(crates: PathBuf) -> Result<(), String> {
     let environment = libraries()?;
     let rllib = sync("rllib", "bindings/python", &["--group", "rllib"])?;
     // Documentation snippets, an example and the notebook use the agents.
@@ -192,15 +197,15 @@ pub fn test_libraries() -> Result<(), String> {
     let gymnasiums = ["1.1.0", "1.2.3"].map(|version| {
         let packages = [&format!("gymnasium=={version}"), "numpy==2.4.6"];
         let folder = tools(&format!("gymnasium-{version}"), &base()?, &packages)?;
-        Ok::<_, String>(format!("{version}={}", folder.display()))
+        Ok::<_, String>(format!("{version}={}", python_of(&folder).display()))
     });
-    let gymnasiums = gymnasiums.into_iter().collect::<Result<Vec<_>, _>>()?.join("/bin/python:");
-    let pythons = [
-        ("ENDLESS_LIBRARIES_PYTHON", rllib.as_path()),
-        // `pytest` appends the path of the program to the last folder.
-        ("ENDLESS_GYMNASIUM_PYTHONS", Path::new(&gymnasiums)),
+    let gymnasiums = gymnasiums.into_iter().collect::<Result<Vec<_>, _>>()?.join(":");
+    let paths = [
+        ("ENDLESS_CRATES", crates),
+        ("ENDLESS_LIBRARIES_PYTHON", python_of(&rllib)),
+        ("ENDLESS_GYMNASIUM_PYTHONS", gymnasiums.into()),
     ];
-    pytest(&environment, "bindings/python", "(slow or libraries) and not original", &pythons)
+    pytest(&environment, "bindings/python", "(slow or libraries) and not original", &paths)
 }
 
 /// Checks the types of the agents and runs all their tests.
@@ -212,10 +217,9 @@ pub fn test_agents() -> Result<(), String> {
 
 /// Runs the tests of the environments' package that compare with the original.
 pub fn test_original() -> Result<(), String> {
-    original()?;
     let environment = environment()?;
     install(&environment)?;
-    pytest(&environment, "bindings/python", "original", &[("ENDLESS_ORIGINAL_PYTHON", &venv_folder("original")?)])
+    pytest(&environment, "bindings/python", "original", &[("ENDLESS_ORIGINAL_PYTHON", original()?)])
 }
 
 fn mypy(environment: &Path, package: &str) -> Result<(), String> {
@@ -224,14 +228,13 @@ fn mypy(environment: &Path, package: &str) -> Result<(), String> {
 }
 
 /// Runs tests, with variables that name the interpreters of other virtual environments.
-fn pytest(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &Path)]) -> Result<(), String> {
+fn pytest(environment: &Path, package: &str, markers: &str, paths: &[(&str, PathBuf)]) -> Result<(), String> {
     // Not `python -m pytest`, which would import the package's folder instead of the installed package.
     let mut pytest = Command::new(environment.join("bin/pytest"));
     pytest.args(["-q", "--timeout", "300", "--durations", "20", "-n", "logical", "--dist", "worksteal", "-m", markers]);
     // There is a worker for each core already.
     pytest.env("OMP_NUM_THREADS", "1");
-    pytest.envs(pythons.iter().map(|(name, folder)| (name, folder.join("bin/python"))));
-    run(pytest.current_dir(workspace().join(package)))
+    run(pytest.envs(paths.iter().cloned()).current_dir(workspace().join(package)))
 }
 
 /// Compares steps per second with the original and, for scale, with EnvPool's environments if EnvPool can be installed.

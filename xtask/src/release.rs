@@ -40,7 +40,11 @@ pub fn build() -> Result<(), String> {
     recreate(&folder)?;
     let source = source_distribution(&tools, &folder)?;
     wheel(&tools, &source, &folder)?;
-    crates(&folder)?;
+    crates()?;
+    for name in CRATES.map(|name| format!("{}.crate", versioned(name))) {
+        let package = target()?.join("package").join(&name);
+        fs::copy(&package, folder.join(name)).map_err(describe(&package))?;
+    }
     for file in files_below(&folder)? {
         println!("{:>12} bytes  {}", fs::metadata(&file).map_err(describe(&file))?.len(), file.display());
     }
@@ -112,43 +116,27 @@ fn check_contents(wheel: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// Packages the crates, and builds the facade and its dependencies from the packages, which shows that they are complete.
-fn crates(folder: &Path) -> Result<(), String> {
-    let build = target()?;
-    let packages = CRATES.map(|name| format!("--package={name}"));
-    run(cargo(&["package", "--locked", "--allow-dirty", "--no-verify", "--quiet"]).args(packages))?;
-    let unpacked = build.join("packaged");
+/// Packages the crates, and unpacks them into a folder, which it returns. A test builds a crate that depends on all of them
+/// from there, which shows that they are complete.
+pub fn crates() -> Result<PathBuf, String> {
+    let (packages, unpacked) = (target()?.join("package"), target()?.join("packaged"));
+    let selected = CRATES.map(|name| format!("--package={name}"));
+    run(cargo(&["package", "--locked", "--allow-dirty", "--no-verify", "--quiet"]).args(selected))?;
     recreate(&unpacked)?;
-    let mut patches = String::from("[patch.crates-io]\n");
-    for name in CRATES {
-        let file = format!("{name}-{}.crate", env!("CARGO_PKG_VERSION"));
-        let package = build.join("package").join(&file);
+    for name in CRATES.map(versioned) {
         // As of the source distribution, the times in the archive are fixed.
-        run(Command::new("tar")
-            .args(["--extract", "--touch", "--file"])
-            .arg(&package)
-            .arg("--directory")
-            .arg(&unpacked))?;
-        let source = unpacked.join(file.trim_end_matches(".crate"));
-        if let Some(missing) = LICENCES.iter().find(|licence| !source.join(licence).exists()) {
+        let mut tar = Command::new("tar");
+        tar.args(["--extract", "--touch", "--file"]).arg(packages.join(format!("{name}.crate")));
+        run(tar.arg("--directory").arg(&unpacked))?;
+        if let Some(missing) = LICENCES.iter().find(|licence| !unpacked.join(&name).join(licence).exists()) {
             return Err(format!("the package of {name} must contain {missing}"));
         }
-        patches += &format!("{name}.path = {:?}\n", source.display().to_string());
-        fs::copy(&package, folder.join(&file)).map_err(describe(&package))?;
     }
-    // Without the workspace, in the tests' profile and folder, for which the dependencies are compiled already.
-    let config = unpacked.join("patches.toml");
-    fs::write(&config, patches).map_err(describe(&config))?;
-    let in_package = |task: &[&str], name: &str| {
-        let mut cargo = cargo(task);
-        cargo.arg("--config").arg(&config).arg("--manifest-path");
-        cargo.arg(unpacked.join(format!("{name}-{}/Cargo.toml", env!("CARGO_PKG_VERSION"))));
-        cargo.env("CARGO_PROFILE_DEV_DEBUG", "false").env("CARGO_TARGET_DIR", &build);
-        cargo
-    };
-    run(&mut in_package(&["build"], "endless-gym"))?;
-    // The tests of the core read recorded cases, which its package must contain.
-    run(&mut in_package(&["check", "--tests"], "endless-gym-core"))
+    Ok(unpacked)
+}
+
+fn versioned(name: &str) -> String {
+    format!("{name}-{}", env!("CARGO_PKG_VERSION"))
 }
 
 /// Maturin with a path on which it finds zig's Python first.

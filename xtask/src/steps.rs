@@ -59,7 +59,7 @@ const STEPS: &[Step] = &[
     rest("documentation", &[], || docs::build(false)),
     rest("rust-original", &[ORIGINAL_PYTHON], || rust::test_original(None)),
     rest("python-original", &[ORIGINAL_PYTHON], python::test_original),
-    rest("libraries", &[], python::test_libraries),
+    rest("libraries", &[], || python::test_libraries(release::crates()?)),
     rest("agents", &[], python::test_agents),
     rest("packages", &[], release::test),
 ];
