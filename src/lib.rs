@@ -62,7 +62,7 @@ pub mod batch {
 
 /// Checks of environments, for the tests of those who write them.
 pub mod conformance {
-    pub use endless_gym_core::conformance::{Outcome, assert_conforms, check};
+    pub use endless_gym_core::conformance::{CountingAllocator, Outcome, assert_conforms, check};
 }
 
 /// Environment ids: spaces, reset parameters, scripted experts.

@@ -1,10 +1,11 @@
 //! The pool's use of the allocator. Each test runs in a separate process, so that it does not count the allocations of
 //! other tests.
 
-use std::alloc::{GlobalAlloc, Layout, System};
+use std::alloc::{GlobalAlloc, Layout};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use endless_gym::batch::zeroed;
+use endless_gym::conformance::CountingAllocator;
 use endless_gym::pool::{Autoreset, NextOptions, PoolConfig, ResetRequest, Seeding};
 use endless_gym::{environments, memory_gym};
 use rand::rngs::SmallRng;
@@ -13,25 +14,25 @@ use rand::{RngExt, SeedableRng};
 use crate::support::player::Player;
 use crate::support::process::alone;
 
-/// The system's allocator, with a count of the allocations and of the bytes in use.
+/// Counts the allocations and the bytes in use of all threads.
 struct Counting;
 
 static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
 static BYTES: AtomicUsize = AtomicUsize::new(0);
 
-// SAFETY: All calls are forwarded unchanged to the system's allocator.
+// SAFETY: All calls are forwarded unchanged to an allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
         BYTES.fetch_add(layout.size(), Ordering::Relaxed);
         // SAFETY: our caller upholds the contract.
-        unsafe { System.alloc(layout) }
+        unsafe { CountingAllocator.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         BYTES.fetch_sub(layout.size(), Ordering::Relaxed);
         // SAFETY: our caller upholds the contract.
-        unsafe { System.dealloc(pointer, layout) }
+        unsafe { CountingAllocator.dealloc(pointer, layout) }
     }
 }
 

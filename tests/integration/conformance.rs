@@ -1,7 +1,9 @@
 //! The checks of environments find seeded mistakes, and nothing in the environments of the project.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::hint::black_box;
 use std::sync::atomic::{AtomicI64, Ordering};
+use std::time::Duration;
 
 use endless_gym::conformance::{assert_conforms, check};
 use endless_gym::environments;
@@ -35,6 +37,8 @@ const ACTION_PANICS: u8 = 11;
 const LIMIT_PANICS: u8 = 12;
 const THREAD_MATTERS: u8 = 13;
 const FEATURE_INFINITE: u8 = 14;
+const TRUTH_OUTSIDE: u8 = 15;
+const ALLOCATES: u8 = 16;
 
 /// Numbers that belong to no environment.
 static RESETS: AtomicI64 = AtomicI64::new(0);
@@ -66,6 +70,7 @@ impl<const MISTAKE: u8> Task for Sum<MISTAKE> {
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(100)),
             ground_truth: TRUTH,
+            ground_truth_bounds: Some((0.0, 1.0)),
             info: INFO,
             parameters: PARAMETERS,
             ..EnvSpec::new(ID, "Add up", ActionSpace::Discrete(3))
@@ -97,15 +102,21 @@ impl<const MISTAKE: u8> Task for Sum<MISTAKE> {
                 self.sum += self.unsaved % 2;
             }
             NEIGHBOURS_COUNT => self.sum += LAST.swap(self.sum, Ordering::Relaxed) % 3,
-            THREAD_MATTERS => {
-                let mut hasher = DefaultHasher::new();
-                std::thread::current().id().hash(&mut hasher);
-                self.sum += (hasher.finish() % 3) as i64;
-            }
+            ALLOCATES => self.kept += black_box(vec![action[0]; 3]).len() as i64 % 3,
+            // Long enough for other threads to join.
+            THREAD_MATTERS => std::thread::sleep(Duration::from_micros(50)),
             _ => {}
         }
         self.sum = self.sum.min(99);
-        let reward = if MISTAKE == REWARD_NAN && self.sum > 40 { f64::NAN } else { 1.0 };
+        let reward = match MISTAKE {
+            REWARD_NAN if self.sum > 40 => f64::NAN,
+            THREAD_MATTERS => {
+                let mut hasher = DefaultHasher::new();
+                std::thread::current().id().hash(&mut hasher);
+                hasher.finish() as f64
+            }
+            _ => 1.0,
+        };
         Transition { reward, terminated: self.sum >= 90, truncated: false }
     }
 
@@ -122,7 +133,11 @@ impl<const MISTAKE: u8> Task for Sum<MISTAKE> {
     }
 
     fn ground_truth(&self, _: &i64, out: &mut [f64]) {
-        out[0] = if MISTAKE == TRUTH_NAN { f64::NAN } else { self.sum as f64 / 100.0 };
+        out[0] = match MISTAKE {
+            TRUTH_NAN => f64::NAN,
+            TRUTH_OUTSIDE => self.sum as f64 / 10.0,
+            _ => self.sum as f64 / 100.0,
+        };
     }
 
     fn info(&self, _: &i64, out: &mut [f64]) {
@@ -154,6 +169,8 @@ fn each_seeded_mistake_is_found() {
         (problems::<Sum<INFO_FRACTION>>(), "the info `sum` is declared an integer"),
         (problems::<Sum<OUTSIDE_SPACE>>(), "are not in Discrete(100)"),
         (problems::<Sum<TRUTH_NAN>>(), "a number of the ground truth is NaN"),
+        (problems::<Sum<ALLOCATES>>(), " allocations in 400 steps"),
+        (problems::<Sum<TRUTH_OUTSIDE>>(), "a number of the ground truth is "),
         (problems::<Sum<ACTION_PANICS>>(), "it panicked: not implemented"),
         (problems::<Sum<LIMIT_PANICS>>(), "`start` = 10: too large"),
         (problems::<Sum<THREAD_MATTERS>>(), "with three threads"),

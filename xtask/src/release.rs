@@ -180,8 +180,10 @@ fn install_and_use(python: &Path, name: &str, package: &Path, page: &str) -> Res
     run(python::uv(&["venv", "--quiet", "--no-project", "--python"])?.arg(python).arg(&environment))?;
     let mut install = python::pip_install(&environment)?;
     install.args(["--reinstall-package", "endless-gym", "--constraint"]).arg(&constraints).arg(package);
-    // Builds a source distribution with the tests' profile, for which the dependencies are already compiled.
-    run(install.env("CARGO_TARGET_DIR", target()?).env("MATURIN_PEP517_ARGS", "--profile dev"))?;
+    // Builds a source distribution with the tests' profile, for which the dependencies are already compiled. Without lines,
+    // so that cargo does not take these crates for those of the workspace.
+    install.env("CARGO_TARGET_DIR", target()?).env("CARGO_PROFILE_DEV_DEBUG", "false");
+    run(install.env("MATURIN_PEP517_ARGS", "--profile dev"))?;
     // Not in the workspace, so that it imports the installed package.
     let mut check = Command::new(environment.join("bin/python"));
     check.arg(workspace().join("xtask/packages/check.py")).args([env!("CARGO_PKG_VERSION"), page]);

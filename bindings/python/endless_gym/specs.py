@@ -110,6 +110,8 @@ class Spec:
     ground_truth_columns: tuple[Meaning, ...]
     #: Whether a single environment of the original returns `info["ground_truth"]` as an int array.
     ground_truth_is_integer: bool
+    #: The least and the largest of its numbers.
+    ground_truth_bounds: tuple[float, float]
     #: Names of the final infos besides `reward` and `length`, and whether the original's value is an int.
     info: tuple[tuple[str, bool], ...]
     #: Names of the feature observation's columns.
@@ -189,11 +191,10 @@ class Spec:
             ) from None
 
     def ground_truth_space(self) -> gymnasium.Space[Any] | None:
-        """The original's space of `info["ground_truth"]`."""
+        """The space of `info["ground_truth"]`, in Memory Gym the original's."""
         if not self.ground_truth:
             return None
-        # Memory Gym's numbers are in 0 to 1; POPGym's, which has no such space, also count.
-        return spaces.Box(0, 1 if self.frame else np.inf, (self.ground_truth,), np.float32)
+        return spaces.Box(*self.ground_truth_bounds, (self.ground_truth,), np.float32)
 
 
 _SPECS: dict[str, Spec] = {}
@@ -301,6 +302,7 @@ def described_spec(described: dict[str, Any], module: str = _native.__name__) ->
         ground_truth=len(described["ground_truth"]),
         ground_truth_columns=_meanings(described["ground_truth"]),
         ground_truth_is_integer=described["ground_truth_is_integer"],
+        ground_truth_bounds=tuple(described["ground_truth_bounds"] or (-np.inf, np.inf)),
         info=tuple((column["name"], column["is_integer"]) for column in described["info"]),
         features=tuple(column["name"] for column in described["features"]),
         described_features=described["observation_space"],

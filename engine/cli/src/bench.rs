@@ -42,7 +42,7 @@ pub struct Args {
     /// Measurements of each method, at least 1.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..))]
     rounds: u16,
-    /// Also measure the original, with this Python interpreter, which must have `memory-gym` installed [default:
+    /// Also measure the original, with this Python interpreter, which must have `memory-gym` or `popgym` installed [default:
     /// the original is not measured].
     #[arg(long, value_name = "PYTHON")]
     original: Option<String>,

@@ -10,7 +10,8 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
 import gymnasium  # noqa: E402
-import memory_gym  # noqa: E402, F401
+
+__import__("popgym" if sys.argv[1].startswith("popgym-") else "memory_gym")
 
 env = gymnasium.make(sys.argv[1], disable_env_checker=True).unwrapped
 env.action_space.seed(0)
@@ -18,7 +19,8 @@ actions = [env.action_space.sample() for _ in range(1009)]
 env.reset(seed=0)
 steps, seconds, start = 0, float(sys.argv[2]), time.perf_counter()
 while time.perf_counter() - start < seconds:
-    if env.step(actions[steps % len(actions)])[2]:
+    _, _, terminated, truncated, _ = env.step(actions[steps % len(actions)])
+    if terminated or truncated:
         env.reset()
     steps += 1
 print(steps / (time.perf_counter() - start))

@@ -9,6 +9,9 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+#[allow(unsafe_code)] // An allocator's methods are unsafe: see its SAFETY comment.
+mod counting;
+
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use serde_json::{Map, Value as Json, json};
@@ -18,6 +21,8 @@ use crate::envs::{ActionSpace, EnvSpec, ObservationSpace, Parameter, ParameterKi
 use crate::pool::{Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
 use crate::random::Generator;
 use crate::raster::PixelFormat;
+
+pub use counting::CountingAllocator;
 
 /// Environments of a pool.
 const NUM_ENVS: usize = 4;
@@ -48,6 +53,9 @@ const RULES: &[(&str, Rule)] = &[
     ("every reset parameter can be played at its limits", limits_are_playable),
 ];
 
+/// For programs with the [`CountingAllocator`].
+const ALLOCATIONS: (&str, Rule) = ("a step does not allocate", steps_allocate_nothing);
+
 /// Checks one id of a registry with random actions. A panic of the environment counts as a problem.
 ///
 /// # Errors
@@ -60,7 +68,7 @@ pub fn check(registry: &Registry, id: &str) -> Result<Vec<Outcome>, UnknownEnvir
         let problem = result.unwrap_or_else(|panic| Err(format!("it panicked: {}", message(&*panic)))).err();
         Outcome { rule, problem }
     };
-    Ok(RULES.iter().map(outcome).collect())
+    Ok(RULES.iter().chain(counting::is_counting().then_some(&ALLOCATIONS)).map(outcome).collect())
 }
 
 /// Checks all ids of a task, for a test in its crate.
@@ -221,10 +229,6 @@ fn is_alone(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
         together.step(&actions)?;
         for (env, (game, action)) in alone.iter_mut().zip(actions.chunks_exact(width)).enumerate() {
             game.step(action)?;
-            // Later episodes continue the environments' own seeds.
-            if game.batch().has_ended(0) {
-                return Ok(());
-            }
             if game.row(0) != together.row(env) {
                 return Err(format!("environment {env} differs from one without neighbours after step {}", step + 1));
             }
@@ -282,7 +286,9 @@ fn numbers_are_declared(registry: &Registry, spec: &EnvSpec) -> Result<(), Strin
                 return Err(at(&format!("the features {row:?} are not in {space}")));
             }
         }
-        if let Some(number) = batch.ground_truth().iter().find(|number| !number.is_finite()) {
+        let (least, largest) = spec.ground_truth_bounds.unwrap_or((f32::MIN, f32::MAX));
+        let bounds = f64::from(least)..=f64::from(largest);
+        if let Some(number) = batch.ground_truth().iter().find(|number| !bounds.contains(number)) {
             return Err(at(&format!("a number of the ground truth is {number}")));
         }
         for (env, row) in batch.info().chunks_exact(spec.info.len().max(1)).enumerate() {
@@ -359,6 +365,25 @@ fn limits_are_playable(registry: &Registry, spec: &EnvSpec) -> Result<(), String
         }
     }
     Ok(())
+}
+
+fn steps_allocate_nothing(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let mut game = Game::started(registry, &config(spec, NUM_ENVS), 29)?;
+    let mut allocations = 0;
+    // Lists grow until they have reached their largest length.
+    for _ in 0..10 {
+        allocations = 0;
+        for _ in 0..STEPS {
+            let actions = game.actions(NUM_ENVS);
+            let before = counting::allocations();
+            game.step(&actions)?;
+            allocations += counting::allocations() - before;
+        }
+        if allocations == 0 {
+            return Ok(());
+        }
+    }
+    Err(format!("{allocations} allocations in {STEPS} steps of {NUM_ENVS} environments; reuse the memory of lists"))
 }
 
 fn limits(parameter: &Parameter) -> Vec<Json> {

@@ -12,3 +12,8 @@ pub fn registry() -> Result<Registry, RegistryError> {
 
 #[cfg(feature = "python")]
 endless_gym_python::module!(_native, registry());
+
+/// The tests check that a step does not allocate.
+#[cfg(test)]
+#[global_allocator]
+static ALLOCATOR: endless_gym::conformance::CountingAllocator = endless_gym::conformance::CountingAllocator;

@@ -109,10 +109,12 @@ pub struct EnvSpec {
     pub actions: &'static [ActionBranch],
     /// Length of the vector observation (float32 in 0..=1); 0 if there is none.
     pub vector_observation: usize,
-    /// Columns of the ground truth (float64; in 0..=1 in Memory Gym); empty if there is none.
+    /// Columns of the ground truth (float64); empty if there is none.
     pub ground_truth: &'static [Column],
     /// Whether the ground truth of a single environment has an integer dtype in the original.
     pub ground_truth_is_integer: bool,
+    /// The least and the largest number of the ground truth; `None` if it has no bounds.
+    pub ground_truth_bounds: Option<(f32, f32)>,
     /// Columns of the final info in addition to `reward` and `length`.
     pub info: &'static [InfoColumn],
     /// Columns of the feature observation (float32), which the original does not have.
@@ -141,6 +143,7 @@ impl EnvSpec {
             vector_observation: 0,
             ground_truth: &[],
             ground_truth_is_integer: false,
+            ground_truth_bounds: None,
             info: &[],
             features: &[],
             observation_space: None,
