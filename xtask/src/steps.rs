@@ -35,33 +35,29 @@ const BROWSER: Need = Need {
     what: "Chromium; apt-get install chromium, or set CHROMIUM to the program's path",
 };
 
-const fn first(name: &'static str, run: fn() -> Result<(), String>) -> Step {
-    Step { name, rest: false, run, needs: &[] }
-}
-
-const fn rest(name: &'static str, needs: &'static [Need], run: fn() -> Result<(), String>) -> Step {
-    Step { name, rest: true, run, needs }
+const fn step(name: &'static str, rest: bool, needs: &'static [Need], run: fn() -> Result<(), String>) -> Step {
+    Step { name, rest, run, needs }
 }
 
 const STEPS: &[Step] = &[
-    first("format", rust::format),
-    first("rust-tests", rust::test),
-    first("clippy", rust::clippy),
-    first("import-cycles", python::cycles),
-    first("python-lint", python::lint),
-    first("python-tests", python::test),
-    rest("files", &[], files::check),
-    rest("rust-ignored", &[], rust::test_ignored),
-    rest("faults", &[], rust::test_faults),
-    rest("instructions", &[VALGRIND], || rust::instructions(false)),
-    rest("loom", &[], rust::loom),
-    rest("browser", &[WASM, BROWSER], web::test),
-    rest("documentation", &[], || docs::build(false)),
-    rest("rust-original", &[ORIGINAL_PYTHON], || rust::test_original(None)),
-    rest("python-original", &[ORIGINAL_PYTHON], python::test_original),
-    rest("libraries", &[], || python::test_libraries(release::crates()?)),
-    rest("agents", &[], python::test_agents),
-    rest("packages", &[], release::test),
+    step("format", false, &[], rust::format),
+    step("rust-tests", false, &[], rust::test),
+    step("clippy", false, &[], rust::clippy),
+    step("import-cycles", false, &[], python::cycles),
+    step("python-lint", false, &[], python::lint),
+    step("python-tests", false, &[], python::test),
+    step("files", true, &[], files::check),
+    step("rust-ignored", true, &[], rust::test_ignored),
+    step("faults", true, &[], rust::test_faults),
+    step("instructions", true, &[VALGRIND], || rust::instructions(false)),
+    step("loom", true, &[], rust::loom),
+    step("browser", true, &[WASM, BROWSER], web::test),
+    step("documentation", true, &[], || docs::build(false)),
+    step("rust-original", true, &[ORIGINAL_PYTHON], || rust::test_original(None)),
+    step("python-original", true, &[ORIGINAL_PYTHON], python::test_original),
+    step("libraries", true, &[], || python::test_libraries(release::crates()?)),
+    step("agents", true, &[], python::test_agents),
+    step("packages", true, &[], release::test),
 ];
 
 /// Prints the names of all steps.
