@@ -14,8 +14,6 @@
 //! rectangles, the rules of single environments) exist for the project's tests and benchmarks and may change in any
 //! version.
 
-use std::io::Write;
-use std::process::ExitCode;
 use std::sync::LazyLock;
 
 pub use endless_gym_memory_gym::{DEFAULT_ENV_ID, memory_gym};
@@ -40,13 +38,16 @@ pub fn environments() -> &'static pool::Registry {
 ///     endless_gym::program(endless_gym::memory_gym())
 /// }
 /// ```
-pub fn program(registry: &pool::Registry) -> ExitCode {
+#[cfg(not(target_arch = "wasm32"))]
+pub fn program(registry: &pool::Registry) -> std::process::ExitCode {
+    use std::io::Write;
+
     let arguments: Vec<_> = std::env::args_os().skip(1).collect();
     match std::env::current_exe() {
         Ok(executable) => endless_gym_cli::main(registry, arguments, &[executable.into()]).into(),
         Err(error) => {
             let _ = writeln!(std::io::stderr(), "endless: cannot find the program's own file: {error}");
-            ExitCode::FAILURE
+            std::process::ExitCode::FAILURE
         }
     }
 }
@@ -95,6 +96,7 @@ pub mod raster {
 }
 
 /// Engines that serve environments in shared memory, their trainers and observers.
+#[cfg(not(target_arch = "wasm32"))]
 pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,

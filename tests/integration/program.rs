@@ -275,6 +275,7 @@ fn new_writes_a_crate_with_the_given_names_and_changes_nothing_that_exists() {
         ("src/task.rs", "EnvSpec::new(\"CountDown-v0\""),
         ("src/main.rs", "count_down::registry()"),
         ("example.py", "count_down:CountDown-v0"),
+        ("src/lib.rs", "endless_gym_web::module!(registry())"),
         ("README.md", "endless-train --env count_down:CountDown-v0"),
     ] {
         let text = std::fs::read_to_string(folder.join(file)).unwrap();
@@ -294,6 +295,30 @@ fn new_writes_a_crate_with_the_given_names_and_changes_nothing_that_exists() {
     }
     assert_eq!(std::fs::read(folder.join("Cargo.toml")).unwrap(), manifest);
     assert!(!place.root().join("maze").exists() && !place.root().join("mystery_path").exists());
+}
+
+/// `cargo xtask test --only browser` writes and plays a page. Here, scripts stand for cargo.
+#[test]
+fn page_says_what_a_crate_or_cargo_lacks() {
+    let place = Place::new();
+    let library = place.root().join("own.wasm");
+    let message = format!(r#"{{"reason":"compiler-artifact","filenames":["{}"]}}"#, library.display());
+    let page = |script: &str| {
+        let cargo = place.script("cargo", script);
+        place.endless(&["page"]).env("CARGO", cargo).current_dir(place.root()).output().unwrap()
+    };
+    let builds = format!("echo '{message}'");
+    for (script, engine, part) in [
+        ("exit 101", &b""[..], "run `rustup target add wasm32-unknown-unknown`"),
+        ("true", b"", "must have the type `cdylib`"),
+        (&builds, b"\0asm", "must call `endless_gym_web::module!(registry())`"),
+    ] {
+        std::fs::write(&library, engine).unwrap();
+        let refused = page(script);
+        assert_eq!(refused.status.code(), Some(1));
+        assert!(text(&refused.stderr).contains(part), "{}", text(&refused.stderr));
+        assert!(!place.root().join("site").exists());
+    }
 }
 
 #[test]

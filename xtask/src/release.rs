@@ -15,7 +15,7 @@ const TOOLS: [&str; 2] = ["maturin==1.16.0", "ziglang==0.17.1"];
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, dependencies first.
-const CRATES: [&str; 9] = [
+const CRATES: [&str; 10] = [
     "endless-gym-core",
     "endless-gym-memory-gym",
     "endless-gym-popgym",
@@ -25,6 +25,7 @@ const CRATES: [&str; 9] = [
     "endless-gym-cli",
     "endless-gym",
     "endless-gym-python",
+    "endless-gym-web",
 ];
 
 const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];

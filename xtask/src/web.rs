@@ -20,9 +20,6 @@ pub const MISSING: &str = "Rust's standard library for wasm32-unknown-unknown; r
 /// Limit of the total bytes of all files, each compressed, which a browser downloads at most.
 const LIMIT: usize = 1_000_000;
 
-/// The file to which the build adds the list of the others and a checksum of them.
-const WORKER: &str = "worker.js";
-
 /// A compiler with the target's standard library, or with its sources.
 pub enum Toolchain {
     /// The compiler on the path.
@@ -49,12 +46,20 @@ impl Toolchain {
         // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
         cargo.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
         cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
+        let built = self.set(&mut cargo)?;
+        run(&mut cargo)?;
+        Ok(built.join(TARGET).join("release"))
+    }
+
+    /// Sets the variables with which cargo, or a command that runs it, builds with this compiler, and returns the target
+    /// directory.
+    fn set(&self, command: &mut Command) -> Result<PathBuf, String> {
         let mut built = target()?;
         if let Toolchain::Debian(folder) = self {
             // A separate folder, so that the two compilers do not invalidate each other's builds.
             built.push("wasm");
-            cargo.args(["-Zbuild-std=std,panic_abort", "--target-dir"]).arg(&built);
-            cargo.env("RUSTC", folder.join("bin/rustc")).env("RUSTC_BOOTSTRAP", "1");
+            command.env("CARGO_UNSTABLE_BUILD_STD", "std,panic_abort").env("CARGO_TARGET_DIR", &built);
+            command.env("RUSTC", folder.join("bin/rustc")).env("RUSTC_BOOTSTRAP", "1");
             let libraries = format!("lib/{}-linux-gnu", std::env::consts::ARCH);
             for (variable, first) in
                 [("PATH", ["bin", "lib/llvm/bin"]), ("LD_LIBRARY_PATH", [&libraries, "lib/llvm/lib"])]
@@ -62,11 +67,10 @@ impl Toolchain {
                 let before = std::env::var_os(variable).unwrap_or_default();
                 let before = std::env::split_paths(&before).filter(|path| !path.as_os_str().is_empty());
                 let all = first.iter().map(|path| folder.join(path)).chain(before);
-                cargo.env(variable, std::env::join_paths(all).map_err(|error| format!("{variable}: {error}"))?);
+                command.env(variable, std::env::join_paths(all).map_err(|error| format!("{variable}: {error}"))?);
             }
         }
-        run(&mut cargo)?;
-        Ok(built.join(TARGET).join("release"))
+        Ok(built)
     }
 }
 
@@ -85,20 +89,13 @@ pub fn folder() -> Result<PathBuf, String> {
 /// Builds the page. Fails if there is no compiler for WebAssembly, or if the page is too large.
 pub fn build() -> Result<(), String> {
     let built = Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-web"])?;
-    let mut files = vec![("engine.wasm".to_owned(), read(&built.join("endless_gym_web.wasm"))?)];
-    let page = workspace().join("engine/view/page/files");
-    let entries = fs::read_dir(&page).map_err(describe(&page))?;
-    for entry in entries {
-        let path = entry.map_err(describe(&page))?.path();
-        files.push((path.file_name().unwrap_or_default().to_string_lossy().into_owned(), read(&path)?));
-    }
-    files.sort();
-    complete_worker(&mut files)?;
+    let engine = read(&built.join("endless_gym_web.wasm"))?;
+    let files = endless_gym_page::files(&engine, |_| true);
     write(&folder()?, &files)?;
-    // The program embeds the page from here. Unchanged files are not rewritten, to avoid a rebuild.
+    // The program embeds the engine from here. It is not rewritten unchanged, to avoid a rebuild.
     let embedded = workspace().join("engine/view/page/built");
-    if files.iter().any(|(name, bytes)| fs::read(embedded.join(name)).ok().as_ref() != Some(bytes)) {
-        write(&embedded, &files)?;
+    if fs::read(embedded.join("engine.wasm")).ok().as_ref() != Some(&engine) {
+        write(&embedded, &[("engine.wasm", engine)])?;
     }
     let compressed = files.iter().map(|(_, bytes)| compressed(bytes)).sum::<usize>();
     println!("    {} files, {compressed} bytes compressed, {}", files.len(), folder()?.join("index.html").display());
@@ -108,28 +105,34 @@ pub fn build() -> Result<(), String> {
     Ok(())
 }
 
-/// Builds the page, and tests it and the page of a running engine in a browser.
+/// Builds the page, and tests it, a page with environments of one's own, and the page of a running engine in a browser.
 pub fn test() -> Result<(), String> {
     build()?;
+    build_own()?;
     // Skip tests that only measure or make pictures.
     let tests = ["--ignored", "--test-threads", "1", "--skip", "measure"];
     run(cargo(&["test", "--locked", "--package", "endless-gym-web", "--test", "browser", "--"]).args(tests))?;
     run(cargo(&["test", "--locked", "--test", "integration", "--"]).args(tests).arg("browser::"))
 }
 
-/// Writes the list of files and a checksum of them into the service worker, which caches them for offline use.
-fn complete_worker(files: &mut [(String, Vec<u8>)]) -> Result<(), String> {
-    let mut checksum = flate2::Crc::new();
-    files.iter().for_each(|(_, bytes)| checksum.update(bytes));
-    let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).filter(|name| *name != WORKER).collect();
-    let lines = format!("const VERSION = \"{:08x}\";\nconst FILES = {};\n", checksum.sum(), serde_json::json!(names));
-    let (_, worker) =
-        files.iter_mut().find(|(name, _)| name == WORKER).ok_or_else(|| format!("{WORKER} is missing"))?;
-    worker.splice(0..0, lines.into_bytes());
-    Ok(())
+/// Writes a crate in target/own by `endless new`, and its page by `endless page`, with the environments of the tests.
+fn build_own() -> Result<(), String> {
+    run(&mut cargo(&["build", "--locked", "--bin", "endless"]))?;
+    let (program, folder) = (target()?.join("debug/endless"), target()?.join("own"));
+    recreate(&folder)?;
+    run(Command::new(&program).args(["new", "own", "--path"]).arg(workspace()).current_dir(&folder))?;
+    // With the versions of the dependencies that are tested.
+    let own = workspace().join("bindings/web/tests/own/lib.rs");
+    for (from, to) in [(own, "own/src/lib.rs"), (workspace().join("Cargo.lock"), "own/Cargo.lock")] {
+        fs::copy(&from, folder.join(to)).map_err(describe(&from))?;
+    }
+    let mut page = Command::new(&program);
+    page.args(["page", "--manifest-path", "own/Cargo.toml"]).current_dir(&folder);
+    Toolchain::find().ok_or(MISSING)?.set(&mut page)?;
+    run(&mut page)
 }
 
-fn write(folder: &Path, files: &[(String, Vec<u8>)]) -> Result<(), String> {
+fn write(folder: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), String> {
     recreate(folder)?;
     files.iter().try_for_each(|(name, bytes)| {
         let path = folder.join(name);

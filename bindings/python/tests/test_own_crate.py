@@ -21,11 +21,11 @@ PAGE = ROOT / "docs/environments/own.md"
 def test_the_page_leads_from_an_empty_folder_to_a_trained_agent(tmp_path: Path) -> None:
     # Crates that the workspace has, or packages unpacked in the folder ENDLESS_CRATES, instead of those of crates.io.
     packages = os.environ.get("ENDLESS_CRATES")
-    manifests = (
-        Path(packages).glob("*/Cargo.toml") if packages else [ROOT / "Cargo.toml", ROOT / "bindings/python/Cargo.toml"]
-    )
+    crates = [ROOT, ROOT / "bindings/python", ROOT / "bindings/web"]
+    folders = Path(packages).glob("*") if packages else crates
+    manifests = [folder / "Cargo.toml" for folder in folders]
     names = {re.search(r'^name = "(.+)"', path.read_text(), re.M)[1]: path.parent for path in manifests}
-    assert "endless-gym-python" in names
+    assert {"endless-gym-python", "endless-gym-web"} <= names.keys()
     config = tmp_path / ".cargo/config.toml"
     config.parent.mkdir()
     patches = "".join(f'{name} = {{ path = "{folder}" }}\n' for name, folder in names.items())

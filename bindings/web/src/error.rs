@@ -1,7 +1,7 @@
 //! Errors of the page's engine. Errors of reset parameters, actions and traces come unchanged from the core.
 
 use endless_gym_core::envs::UnknownEnvironment;
-use endless_gym_core::pool::{ExpertsError, NoExpert, PoolError};
+use endless_gym_core::pool::{ExpertsError, NoExpert, PoolError, RegistryError};
 use endless_gym_core::trace::TraceError;
 use thiserror::Error;
 
@@ -34,6 +34,12 @@ pub enum WebError {
     ScriptIsOver,
     #[error("a wall must have at least one environment and one column")]
     EmptyWall,
+    #[error("`{id}` has no frames, which a wall shows; play it alone")]
+    NoFrame { id: &'static str },
+    #[error(transparent)]
+    Registry(#[from] RegistryError),
+    #[error("the page needs at least one environment")]
+    NoEnvironments,
     #[error(transparent)]
     UnknownEnvironment(#[from] UnknownEnvironment),
     #[error(transparent)]

@@ -4,15 +4,16 @@ use std::rc::Rc;
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs::Expert;
-use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym_core::pool::{
+    Autoreset, NoExpert, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads,
+};
 use endless_gym_core::trace::{Recorder, Trace};
-use endless_gym_memory_gym::{SCREEN, memory_gym};
 use serde_json::{Map, Value as Json, json};
 
 use crate::agent::{Agent, Memory};
 use crate::clues::Clues;
 use crate::error::WebError;
-use crate::pixels::{RGBA_BYTES, put_observation, put_view};
+use crate::pixels::{put_observation, put_view};
 
 /// Who chooses the action of a step.
 pub enum Player {
@@ -28,7 +29,8 @@ pub struct Game {
     options: OptionMap,
     seed: Option<u64>,
     recorder: Recorder,
-    expert: Box<dyn Expert>,
+    /// The scripted expert, if there is one.
+    expert: Option<Box<dyn Expert>>,
     /// Whether the expert has seen every observation of the episode so far.
     expert_is_in: bool,
     /// The agent's memory, if it has played the episode from its start.
@@ -43,29 +45,36 @@ pub struct Game {
 
 impl Game {
     /// Starts an episode of a new environment, so that it depends only on these arguments.
-    pub fn start(id: &str, options: OptionMap, seed: u64) -> Result<Self, WebError> {
-        Self::new(id, options, Some(seed), None)
+    pub fn start(registry: &Registry, id: &str, options: OptionMap, seed: u64) -> Result<Self, WebError> {
+        Self::new(registry, id, options, Some(seed), None)
     }
 
     /// Starts the first episode of a trace.
-    pub fn replay(trace: Trace) -> Result<Self, WebError> {
+    pub fn replay(registry: &Registry, trace: Trace) -> Result<Self, WebError> {
         let (id, options) = (trace.env.clone(), trace.options.clone());
         let seed = trace.episodes.first().and_then(|episode| episode.seed);
-        Self::new(&id, options, seed, Some((trace, 0)))
+        Self::new(registry, &id, options, seed, Some((trace, 0)))
     }
 
-    fn new(id: &str, options: OptionMap, seed: Option<u64>, script: Option<(Trace, usize)>) -> Result<Self, WebError> {
+    fn new(
+        registry: &Registry,
+        id: &str,
+        options: OptionMap,
+        seed: Option<u64>,
+        script: Option<(Trace, usize)>,
+    ) -> Result<Self, WebError> {
         let config = PoolConfig {
             options: ResetOptions::Shared(options.clone()),
             autoreset: Autoreset::Disabled,
             seeding: Seeding::Continue { seed: Some(0) },
-            features: true,
+            features: !registry.spec(id)?.features.is_empty(),
             ..PoolConfig::new(id, 1)
         };
-        let pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
+        let pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let blocks = zeroed(pool.layout().blocks());
+        let rgba = pool.spec().frame.map_or(0, |frame| frame.width * frame.height * 4);
         let mut game = Game {
-            expert: memory_gym().expert(pool.spec().id)?,
+            expert: registry.expert(id).ok(),
             expert_is_in: true,
             agent_memory: None,
             clues: Clues::new(pool.spec()),
@@ -76,8 +85,8 @@ impl Game {
             options,
             seed,
             script,
-            observation: vec![0; RGBA_BYTES],
-            view: vec![0; RGBA_BYTES],
+            observation: vec![0; rgba],
+            view: vec![0; rgba],
         };
         game.reset(seed)?;
         Ok(game)
@@ -90,7 +99,7 @@ impl Game {
             None => self.pool.reset(ResetRequest::All, &mut self.blocks)?,
         }
         self.recorder.reset(seed, &self.pool, &self.blocks);
-        self.expert.reset();
+        self.expert.iter_mut().for_each(|expert| expert.reset());
         self.expert_is_in = true;
         self.agent_memory = None;
         self.clues.reset();
@@ -112,9 +121,11 @@ impl Game {
             Player::Agent(agent) => self.ask(&agent)?,
             Player::Expert if !self.expert_is_in => return Err(WebError::LateExpert),
             Player::Expert => {
+                let id = self.pool.spec().id.to_owned();
+                let expert = self.expert.as_mut().ok_or(NoExpert { id })?;
                 self.agent_memory = None;
                 let batch = Batch::new(self.pool.layout(), &self.blocks);
-                self.expert.act(batch.features(), batch.vector_observation(), &mut self.action);
+                expert.act(batch.features(), batch.vector_observation(), &mut self.action);
             }
             Player::Trace => {
                 let played = self.length();
@@ -168,20 +179,21 @@ impl Game {
     }
 
     /// Draws both pictures. Call it once per step, since each call advances the clue's picture in the ground-truth
-    /// view.
+    /// view. Without frames, there are none.
     fn draw(&mut self) -> Result<(), WebError> {
-        put_view(&self.pool.ground_truth_view(0)?, &mut self.view);
+        let Some(shape) = self.pool.spec().frame else { return Ok(()) };
+        put_view(&self.pool.ground_truth_view(0)?, shape, &mut self.view);
         let batch = Batch::new(self.pool.layout(), &self.blocks);
-        put_observation(batch.observation(), &mut self.observation, SCREEN);
+        put_observation(batch.observation(), shape, &mut self.observation, shape.width);
         Ok(())
     }
 
-    /// The observation, 84x84 RGBA.
+    /// The observation, RGBA of the frame's size.
     pub fn observation(&self) -> &[u8] {
         &self.observation
     }
 
-    /// The ground-truth view, 84x84 RGBA.
+    /// The ground-truth view, RGBA of the frame's size.
     pub fn view(&self) -> &[u8] {
         &self.view
     }
@@ -196,7 +208,7 @@ impl Game {
     /// The episode's state, which the page shows next to the pictures.
     pub fn state(&self) -> Result<Json, WebError> {
         let batch = self.batch();
-        let done = batch.terminated()[0] == 1;
+        let done = batch.has_ended(0);
         let columns = self.pool.spec().info.iter().zip(batch.info());
         let info: Map<String, Json> = columns.map(|(column, value)| (column.name.to_owned(), json!(value))).collect();
         let options: Map<String, Json> =
@@ -220,6 +232,8 @@ impl Game {
             "clues": self.clues.shown(),
             "action": self.action,
             "vector": batch.vector_observation(),
+            // Shown if there are no frames.
+            "features": self.pool.spec().frame.is_none().then(|| batch.features()),
             "recording": recording,
         }))
     }

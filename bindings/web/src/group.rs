@@ -1,9 +1,11 @@
 //! Self-playing environments of one id.
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
-use endless_gym_core::pool::{Experts, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym_core::pool::{
+    Experts, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads,
+};
 use endless_gym_core::random::Generator;
-use endless_gym_memory_gym::{FRAME, memory_gym};
+use endless_gym_core::raster::FrameShape;
 use serde_json::{Value as Json, json};
 
 use crate::error::WebError;
@@ -14,6 +16,7 @@ enum Policy {
 }
 
 pub struct Group {
+    shape: FrameShape,
     pool: Pool,
     blocks: Vec<Block>,
     policy: Policy,
@@ -24,42 +27,49 @@ pub struct Group {
 }
 
 impl Group {
-    pub fn new(id: &str, num_envs: usize, options: OptionMap, expert: bool, seed: u64) -> Result<Self, WebError> {
+    /// Environments that their experts play, or random actions.
+    pub fn new(
+        registry: &Registry,
+        id: &str,
+        num_envs: usize,
+        options: OptionMap,
+        expert: bool,
+        seed: u64,
+    ) -> Result<Self, WebError> {
+        let spec = registry.spec(id)?;
+        let shape = spec.frame.ok_or(WebError::NoFrame { id: spec.id })?;
         let config = PoolConfig {
             options: ResetOptions::Shared(options),
             seeding: Seeding::Continue { seed: Some(seed) },
             features: expert,
             ..PoolConfig::new(id, num_envs)
         };
-        let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
+        let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;
-        let spec = pool.spec();
         let policy = match expert {
-            true => Policy::Experts(Experts::new(memory_gym(), id, num_envs, config.autoreset)?),
+            true => Policy::Experts(Experts::new(registry, id, num_envs, config.autoreset)?),
             false => Policy::Random(Generator::from_seed(seed)),
         };
         let actions = vec![0; num_envs * spec.action_space.width()];
-        Ok(Group { pool, blocks, policy, actions, episodes: 0, returns: 0.0, lengths: 0.0 })
+        Ok(Group { shape, pool, blocks, policy, actions, episodes: 0, returns: 0.0, lengths: 0.0 })
     }
 
     /// Steps every environment. The step after an episode's end starts the next one.
     pub fn step(&mut self) -> Result<(), WebError> {
-        let branches = self.pool.spec().action_space.branches();
+        let space = &self.pool.spec().action_space;
         let batch = Batch::new(self.pool.layout(), &self.blocks);
         match &mut self.policy {
             Policy::Random(random) => {
-                for row in self.actions.chunks_exact_mut(branches.len()) {
-                    for (number, choices) in row.iter_mut().zip(branches) {
-                        *number = random.integers(0, i64::from(*choices)) as i32;
-                    }
+                for action in self.actions.chunks_exact_mut(space.width()) {
+                    action.copy_from_slice(&space.sample(random));
                 }
             }
             Policy::Experts(experts) => experts.act(&batch, &mut self.actions)?,
         }
         self.pool.step(&self.actions, &mut self.blocks)?;
         let batch = Batch::new(self.pool.layout(), &self.blocks);
-        for env in (0..batch.terminated().len()).filter(|env| batch.terminated()[*env] == 1) {
+        for env in (0..batch.layout().num_envs()).filter(|env| batch.has_ended(*env)) {
             self.episodes += 1;
             self.returns += batch.episode_return()[env];
             self.lengths += f64::from(batch.episode_length()[env]);
@@ -67,9 +77,14 @@ impl Group {
         Ok(())
     }
 
-    /// The observations, one after the other.
-    pub fn observations(&self) -> impl Iterator<Item = &[u8]> {
-        Batch::new(self.pool.layout(), &self.blocks).observation().chunks_exact(FRAME.bytes())
+    /// The observations, one after the other, and their shape.
+    pub fn observations(&self) -> impl Iterator<Item = (&[u8], FrameShape)> {
+        let observations = Batch::new(self.pool.layout(), &self.blocks).observation();
+        observations.chunks_exact(self.shape.bytes()).map(|observation| (observation, self.shape))
+    }
+
+    pub fn shape(&self) -> FrameShape {
+        self.shape
     }
 
     /// Episodes so far, and the means of their returns and lengths.

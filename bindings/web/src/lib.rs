@@ -1,10 +1,25 @@
 //! The page's engine: one game that a person, an expert, a trained agent or a trace plays, and a wall of many
 //! environments.
 //!
+//! [`module!`] makes a library of the type `cdylib` the engine of a page with the environments of a registry. A crate with
+//! environments of its own depends on this one without its default features, one of which defines the engine with those of
+//! Memory Gym:
+//!
+//! ```ignore
+//! #[cfg(target_arch = "wasm32")]
+//! endless_gym_web::module!(Registry::new().with::<TMaze>());
+//! ```
+//!
+//! `endless page` builds such a crate and writes its page. `endless new` writes such a crate.
+//!
 //! The interface to JavaScript is a few functions that pass numbers. [`input`] allocates memory for a request: JSON, or
 //! the bytes of a trace. [`call`] and [`open`] write their answer to [`output`]: JSON, an error's text or bytes.
 //! JavaScript reads pictures directly from memory, as RGBA indexed \[row\]\[column\]. No function takes a pointer, so
 //! nothing here is unsafe, and the page needs no generated code.
+
+// The crate of the tests names it as users do.
+#[cfg(test)]
+extern crate endless_gym_core as endless_gym;
 
 mod agent;
 mod clues;
@@ -17,7 +32,28 @@ mod wall;
 
 use std::cell::RefCell;
 
+use endless_gym_core::pool::{Registry, RegistryError};
 use request::{App, Request};
+
+#[cfg(feature = "memory-gym")]
+module!(Ok(endless_gym_memory_gym::memory_gym().clone()));
+
+/// Defines the function that sets the environments of the page, those of `$registry`, a `Result<Registry, RegistryError>`.
+#[macro_export]
+macro_rules! module {
+    ($registry:expr) => {
+        /// Sets the environments of the page. JavaScript calls it first.
+        #[unsafe(no_mangle)]
+        pub extern "C" fn environments() -> u32 {
+            $crate::populate($registry)
+        }
+    };
+}
+
+/// Sets the environments of the page; [`module!`] calls it. Returns the kind of the output, like [`call`].
+pub fn populate(registry: Result<Registry, RegistryError>) -> u32 {
+    reply(|app, _| request::set_environments(app, registry?))
+}
 
 /// What [`call`] and [`open`] return: the kind of data in [`output`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,13 +112,13 @@ pub extern "C" fn output_length() -> usize {
     OUTPUT.with_borrow(Vec::len)
 }
 
-/// The game's observation: 84x84 RGBA; null without a game.
+/// The game's observation: RGBA of the frame's size; null without a game.
 #[unsafe(no_mangle)]
 pub extern "C" fn observation() -> *const u8 {
     APP.with_borrow(|app| app.game.as_ref().map_or(std::ptr::null(), |game| game.observation().as_ptr()))
 }
 
-/// The game's ground-truth view, not magnified: 84x84 RGBA; null without a game.
+/// The game's ground-truth view, not magnified: RGBA of the frame's size; null without a game.
 #[unsafe(no_mangle)]
 pub extern "C" fn view() -> *const u8 {
     APP.with_borrow(|app| app.game.as_ref().map_or(std::ptr::null(), |game| game.view().as_ptr()))

@@ -4,9 +4,8 @@ use std::collections::HashMap;
 use std::rc::Rc;
 
 use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::pool::{OptionMap, PoolConfig, ResetOptions};
+use endless_gym_core::pool::{OptionMap, PoolConfig, Registry, ResetOptions};
 use endless_gym_core::trace::{Trace, replay};
-use endless_gym_memory_gym::memory_gym;
 use serde::Deserialize;
 use serde_json::{Map, Value as Json, json};
 
@@ -19,6 +18,7 @@ use crate::wall::Wall;
 /// The state of the page.
 #[derive(Default)]
 pub struct App {
+    pub registry: Registry,
     pub game: Option<Game>,
     pub wall: Option<Wall>,
     /// The loaded agents by the id of their environment.
@@ -83,21 +83,26 @@ impl Request {
                 let id = app.game.as_ref().ok_or(WebError::NoGame)?.id();
                 Player::Agent(Rc::clone(app.agents.get(id).ok_or(WebError::NoAgent { id })?))
             }
-            Request::Specs => return Ok(Reply::Json(memory_gym().specs().map(spec).collect())),
+            Request::Specs => {
+                return Ok(Reply::Json(app.registry.specs().map(|entry| spec(&app.registry, entry)).collect()));
+            }
             Request::Check { id, options } => {
                 let options = ResetOptions::Shared(parse(&options));
-                PoolConfig { options, ..PoolConfig::new(&id, 1) }.validate(memory_gym().spec(&id)?)?;
+                PoolConfig { options, ..PoolConfig::new(&id, 1) }.validate(app.registry.spec(&id)?)?;
                 return Ok(Reply::Json(Json::Null));
             }
             Request::Start { id, options, seed } => {
-                let game = Game::start(&id, parse(&options), parse_seed(&seed)?)?;
+                let game = Game::start(&app.registry, &id, parse(&options), parse_seed(&seed)?)?;
                 return Ok(Reply::Json(app.game.insert(game).state()?));
             }
             Request::Save => return Ok(Reply::Bytes(app.game.as_ref().ok_or(WebError::NoGame)?.file()?)),
             Request::Wall { groups, columns, expert, seed } => {
                 let seed = parse_seed(&seed)?;
-                let make =
-                    |group: &WallGroup| Group::new(&group.id, group.num_envs, parse(&group.options), expert, seed);
+                let make = |group: &WallGroup| {
+                    // Where there is no expert, actions are random.
+                    let expert = expert && app.registry.expert(&group.id).is_ok();
+                    Group::new(&app.registry, &group.id, group.num_envs, parse(&group.options), expert, seed)
+                };
                 let groups = groups.iter().map(make).collect::<Result<_, _>>()?;
                 return Ok(Reply::Json(app.wall.insert(Wall::new(groups, columns)?).state()));
             }
@@ -111,11 +116,20 @@ impl Request {
     }
 }
 
+/// Sets the environments.
+pub fn set_environments(app: &mut App, registry: Registry) -> Result<Reply, WebError> {
+    if registry.specs().next().is_none() {
+        return Err(WebError::NoEnvironments);
+    }
+    app.registry = registry;
+    Ok(Reply::Json(Json::Null))
+}
+
 /// Replays a trace file, and makes it the game.
 pub fn open(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
     let trace = Trace::read(file)?;
-    let outcome = replay(memory_gym(), &trace)?;
-    let state = app.game.insert(Game::replay(trace)?).state()?;
+    let outcome = replay(&app.registry, &trace)?;
+    let state = app.game.insert(Game::replay(&app.registry, trace)?).state()?;
     Ok(Reply::Json(json!({
         "episodes": outcome.episodes,
         "steps": outcome.steps,
@@ -141,9 +155,10 @@ pub fn step_wall(app: &mut App, count: u32) -> Result<Reply, WebError> {
 }
 
 /// An entry of the table, with the engine's own texts for limits and defaults.
-fn spec(spec: &EnvSpec) -> Json {
+fn spec(registry: &Registry, spec: &EnvSpec) -> Json {
     let mut value = json!(spec);
     value["action_branches"] = json!(spec.action_space.branches());
+    value["has_expert"] = registry.expert(spec.id).is_ok().into();
     for (parameter, json) in spec.parameters.iter().zip(value["parameters"].as_array_mut().into_iter().flatten()) {
         json["default_text"] = parameter.default_text().into();
         json["allowed"] = parameter.allowed().into();

@@ -28,6 +28,7 @@ fn start(id: &str, seed: &str) -> Result<Json, String> {
 
 #[test]
 fn every_environment_is_played_saved_and_opened_again() {
+    environments();
     for spec in memory_gym().specs() {
         let mut state = start(spec.id, "7").unwrap();
         assert_eq!(state["seed"], "7");
@@ -56,6 +57,7 @@ fn every_environment_is_played_saved_and_opened_again() {
 
 #[test]
 fn errors_are_those_of_the_engine() {
+    environments();
     for (wrong, message) in [
         (json!({"start": {"id": "Pong-v0", "options": {}, "seed": "1"}}), "no environment `Pong-v0`; there are Mort"),
         (
@@ -86,6 +88,7 @@ fn errors_are_those_of_the_engine() {
 
 #[test]
 fn the_expert_plays_from_the_first_step_or_not_at_all() {
+    environments();
     start("MortarMayhem-v0", "18446744073709551615").unwrap();
     request(&json!({"step": {"action": [0, 0]}})).unwrap();
     let late = request(&json!("step_of_expert")).unwrap_err();
@@ -97,6 +100,7 @@ fn the_expert_plays_from_the_first_step_or_not_at_all() {
 
 #[test]
 fn the_table_has_what_a_form_needs() {
+    environments();
     let table = request(&json!("specs")).unwrap();
     assert_eq!(table.as_array().unwrap().len(), memory_gym().specs().count());
     let parameter = &table[0]["parameters"][4];
@@ -108,6 +112,7 @@ fn the_table_has_what_a_form_needs() {
 
 #[test]
 fn a_wall_plays_all_environments_at_once() {
+    environments();
     for expert in [false, true] {
         let groups: Vec<Json> =
             memory_gym().specs().map(|spec| json!({"id": spec.id, "num_envs": 3, "options": {}})).collect();
@@ -123,4 +128,69 @@ fn a_wall_plays_all_environments_at_once() {
         let opaque = picture.chunks_exact(4).filter(|pixel| pixel[3] == 255).count();
         assert_eq!(opaque, 30 * SCREEN * SCREEN);
     }
+}
+
+#[path = "../tests/own/lib.rs"]
+mod own;
+
+#[test]
+fn environments_of_ones_own_are_played_saved_and_opened_again() {
+    assert_eq!(populate(own::registry()), Kind::Json as u32);
+    // The bits of 0.5, as the page sends them.
+    for (id, action) in
+        [("Small-v0", json!([3])), ("Numbers-v0", json!([2, 4])), ("Slider-v0", json!([0x3f00_0000, 0]))]
+    {
+        let mut state = start(id, "7").unwrap();
+        while state["done"] == false {
+            state = request(&json!({"step": {"action": action}})).unwrap();
+        }
+        assert_eq!((&state["action"], &state["length"]), (&action, &json!(own::STEPS)), "a truncated episode is over");
+        let frame = own::registry().unwrap().spec(id).unwrap().frame;
+        APP.with_borrow(|app| {
+            let game = app.game.as_ref().unwrap();
+            let bytes = frame.map_or(0, |frame| frame.width * frame.height * 4);
+            assert_eq!((game.observation().len(), game.view().len()), (bytes, bytes));
+            if frame.is_some() {
+                assert_eq!(game.observation(), game.view());
+                assert!(game.observation().contains(&200), "{id}");
+            }
+        });
+        let features = if frame.is_some() { Json::Null } else { json!([2.0, 4.0]) };
+        assert_eq!(state["features"], features, "{id}");
+        put(br#""save""#);
+        assert_eq!(call(), Kind::Bytes as u32);
+        put(&answer());
+        assert_eq!(open(), Kind::Json as u32, "{}", String::from_utf8_lossy(&answer()));
+        let opened: Json = serde_json::from_slice(&answer()).unwrap();
+        assert_eq!((&opened["differences"], &opened["steps"]), (&json!(0), &state["length"]), "{id}");
+        assert_eq!(request(&json!("step_of_expert")).unwrap_err(), format!("`{id}` has no scripted expert"));
+    }
+}
+
+#[test]
+fn a_wall_has_frames_of_several_sizes() {
+    populate(own::registry());
+    let wall = |ids: &[&str]| {
+        let groups: Vec<Json> = ids.iter().map(|id| json!({"id": id, "num_envs": 2, "options": {}})).collect();
+        request(&json!({"wall": {"groups": groups, "columns": 2, "expert": true, "seed": "3"}}))
+    };
+    let state = wall(&["Small-v0", "Slider-v0"]).unwrap();
+    // Two rows and columns of cells for frames with 20 columns and 12 rows.
+    assert_eq!((&state["width"], &state["height"]), (&json!(2 * 24 - 4), &json!(2 * 16 - 4)));
+    assert_eq!(step_wall(2 * own::STEPS), Kind::Json as u32);
+    let state: Json = serde_json::from_slice(&answer()).unwrap();
+    assert!(state["groups"].as_array().unwrap().iter().all(|group| group["episodes"].as_u64() >= Some(2)), "{state}");
+    let picture = APP.with_borrow_mut(|app| app.wall.as_mut().unwrap().draw().to_vec());
+    let opaque = picture.chunks_exact(4).filter(|pixel| pixel[3] == 255).count();
+    assert_eq!(opaque, 2 * 12 * 12 + 2 * 20 * 8);
+    assert_eq!(wall(&["Numbers-v0"]).unwrap_err(), "`Numbers-v0` has no frames, which a wall shows; play it alone");
+}
+
+#[test]
+fn a_page_needs_environments() {
+    assert_eq!(populate(Ok(Registry::new())), Kind::Error as u32);
+    assert_eq!(answer(), b"the page needs at least one environment");
+    let twice = own::registry().and_then(Registry::with::<own::Small>);
+    assert_eq!(populate(twice), Kind::Error as u32);
+    assert_eq!(answer(), b"the registry already has an environment `Small-v0`");
 }

@@ -1,6 +1,6 @@
 //! Many environments as one picture.
 
-use endless_gym_memory_gym::SCREEN;
+use endless_gym_core::raster::FrameShape;
 use serde_json::{Value as Json, json};
 
 use crate::error::WebError;
@@ -14,6 +14,8 @@ pub struct Wall {
     groups: Vec<Group>,
     columns: usize,
     rows: usize,
+    /// Width and height of the largest frame.
+    cell: (usize, usize),
     picture: Vec<u8>,
 }
 
@@ -24,17 +26,20 @@ impl Wall {
         if count == 0 || columns == 0 {
             return Err(WebError::EmptyWall);
         }
-        let mut wall = Wall { groups, columns, rows: count.div_ceil(columns), picture: Vec::new() };
+        let shapes = || groups.iter().map(Group::shape);
+        let largest = |side: fn(FrameShape) -> usize| shapes().map(side).max().unwrap_or(0);
+        let cell = (largest(|shape| shape.width), largest(|shape| shape.height));
+        let mut wall = Wall { groups, columns, rows: count.div_ceil(columns), cell, picture: Vec::new() };
         wall.picture = vec![0; wall.width() * wall.height() * 4];
         Ok(wall)
     }
 
     fn width(&self) -> usize {
-        self.columns * (SCREEN + GAP) - GAP
+        self.columns * (self.cell.0 + GAP) - GAP
     }
 
     fn height(&self) -> usize {
-        self.rows * (SCREEN + GAP) - GAP
+        self.rows * (self.cell.1 + GAP) - GAP
     }
 
     pub fn step(&mut self, count: u32) -> Result<(), WebError> {
@@ -44,10 +49,10 @@ impl Wall {
     /// The picture, RGBA.
     pub fn draw(&mut self) -> &[u8] {
         let stride = self.width();
-        for (number, observation) in self.groups.iter().flat_map(Group::observations).enumerate() {
+        for (number, (observation, shape)) in self.groups.iter().flat_map(Group::observations).enumerate() {
             let (row, column) = (number / self.columns, number % self.columns);
-            let start = (row * stride + column) * (SCREEN + GAP);
-            put_observation(observation, &mut self.picture[4 * start..], stride);
+            let start = row * (self.cell.1 + GAP) * stride + column * (self.cell.0 + GAP);
+            put_observation(observation, shape, &mut self.picture[4 * start..], stride);
         }
         &self.picture
     }

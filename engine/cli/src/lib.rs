@@ -18,6 +18,7 @@ mod new;
 mod open;
 mod options;
 mod output;
+mod page;
 mod picture;
 mod play;
 mod play_command;
@@ -84,6 +85,8 @@ enum Command {
     Check(check::Args),
     /// Write a crate with an environment of your own: its task, its tests, its program and its Python package.
     New(new::Args),
+    /// Write the page that plays the environments of your crate in a browser, for any web server.
+    Page(page::Args),
     /// Write the raw frames of an expert's episode to standard output.
     #[command(hide = true)]
     Frames(frames::Args),
@@ -169,6 +172,7 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::Record(args) => record::run(registry, &args)?,
         Command::Bench(args) => bench::run(registry, &args)?,
         Command::New(args) => new::run(registry, &args)?,
+        Command::Page(args) => page::run(registry, &args)?,
         Command::Frames(args) => frames::run(registry, &args)?,
         Command::Verify(args) => return verify::run(registry, &args),
         Command::Check(args) => return check::run(registry, &args),

@@ -67,7 +67,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
         written.map_err(|error| format!("cannot write {}: {error}", to.display()))?;
     }
     print(format_args!(
-        "wrote the environment {id}; next:\n\n  cd {name}\n  cargo test\n  cargo run --release -- play {id}\n\nREADME.md has more commands"
+        "wrote the environment {id}; next:\n\n  cd {name}\n  cargo test\n  cargo run --release -- play {id} --terminal\n\nREADME.md has more commands"
     ))
 }
 
@@ -93,13 +93,15 @@ fn type_name(name: &str) -> Result<String, Failure> {
 /// The end of a manifest that builds with a checkout.
 fn patch(checkout: &Path) -> Result<String, Failure> {
     let root = fs::canonicalize(checkout).unwrap_or_else(|_| checkout.to_owned());
-    let python = root.join("bindings/python");
+    let (python, web) = (root.join("bindings/python"), root.join("bindings/web"));
     if !python.join("Cargo.toml").is_file() {
         return Err(format!("--path must be a checkout of Endless Gym, got `{}`", checkout.display()).into());
     }
     // A string of JSON is one of TOML.
-    let (root, python) = (serde_json::to_string(&root)?, serde_json::to_string(&python)?);
-    Ok(format!("\n[patch.crates-io]\nendless-gym = {{ path = {root} }}\nendless-gym-python = {{ path = {python} }}\n"))
+    let patches = [("", root), ("-python", python), ("-web", web)]
+        .map(|(end, path)| Ok(format!("endless-gym{end} = {{ path = {} }}\n", serde_json::to_string(&path)?)));
+    let patches: Vec<String> = patches.into_iter().collect::<Result<_, Failure>>()?;
+    Ok(format!("\n[patch.crates-io]\n{}", patches.concat()))
 }
 
 #[cfg(test)]

@@ -125,18 +125,7 @@ impl Game {
     /// Random actions for `num_envs` environments.
     fn actions(&mut self, num_envs: usize) -> Vec<i32> {
         let (space, random) = (&self.pool.spec().action_space, &mut self.random);
-        let action = |_| match space {
-            ActionSpace::Box { low, high } => low
-                .iter()
-                .zip(high.iter())
-                .map(|(low, high)| {
-                    let (low, high) = (low.max(-1e3), high.min(1e3));
-                    (low + random.random_f32() * (high - low)).to_bits().cast_signed()
-                })
-                .collect::<Vec<_>>(),
-            _ => space.branches().iter().map(|choices| random.integers(0, i64::from(*choices)) as i32).collect(),
-        };
-        (0..num_envs).flat_map(action).collect()
+        (0..num_envs).flat_map(|_| space.sample(random)).collect()
     }
 
     fn step(&mut self, actions: &[i32]) -> Result<(), String> {

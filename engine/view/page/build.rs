@@ -1,5 +1,5 @@
-//! Lists the files for `include_bytes!`: those of the built page in a release build if it exists, otherwise the
-//! sources, so that tests do not depend on earlier builds.
+//! Lists the files for `include_bytes!`: the sources, and in a release build the engine if it has been built. Tests do not depend on
+//! earlier builds.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -7,11 +7,11 @@ use std::{env, fs, io};
 
 fn main() -> io::Result<()> {
     let package = PathBuf::from(variable("CARGO_MANIFEST_DIR")?);
-    let (built, files) = (package.join("built"), package.join("files"));
+    let (engine, files) = (package.join("built/engine.wasm"), package.join("files"));
     let is_release = variable("PROFILE")? == "release";
     println!("cargo::rerun-if-changed={}", if is_release { "." } else { "files" });
-    let folder = if is_release && built.join("engine.wasm").exists() { built } else { files };
-    let mut paths: Vec<PathBuf> = fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>()?;
+    let mut paths: Vec<PathBuf> = fs::read_dir(files)?.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>()?;
+    paths.extend(Some(engine).filter(|engine| is_release && engine.exists()));
     paths.sort();
     let mut list = String::from("&[\n");
     for path in &paths {

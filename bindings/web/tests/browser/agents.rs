@@ -21,7 +21,7 @@ fn clues(browser: &mut Chromium) -> Vec<String> {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn an_agent_plays_from_memory() {
-    let (server, mut browser) = (PageServer::start(), start("agents"));
+    let (server, mut browser) = (PageServer::start("web"), start("agents"));
     visit(&mut browser, &server, &format!("env={ID}&seed=200000"));
     assert_eq!(browser.value("document.getElementById('memory').hidden"), true);
     browser.press("KeyG");
@@ -95,7 +95,7 @@ fn an_agent_plays_from_memory() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn only_environments_with_an_agent_offer_it() {
-    let (server, mut browser) = (PageServer::start(), start("no-agents"));
+    let (server, mut browser) = (PageServer::start("web"), start("no-agents"));
     for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
         let disabled = browser.value("document.getElementById('agent').ariaDisabled");
@@ -141,7 +141,7 @@ fn only_environments_with_an_agent_offer_it() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn a_flash_shows_a_sign_besides_its_colour() {
-    let (server, mut browser) = (PageServer::start(), start("flash"));
+    let (server, mut browser) = (PageServer::start("web"), start("flash"));
     visit(&mut browser, &server, &format!("env={ID}&seed=200000"));
     // Record what each flash shows.
     browser.value(

@@ -3,6 +3,7 @@
 mod agents;
 #[path = "../../../../tests/integration/support/chromium.rs"]
 mod chromium;
+mod own;
 mod server;
 
 use std::path::{Path, PathBuf};
@@ -46,7 +47,7 @@ fn open(browser: &mut Chromium, file: &[u8]) -> Json {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn recorded_episodes_replay_without_a_difference() {
-    let (server, mut browser) = (PageServer::start(), start("traces"));
+    let (server, mut browser) = (PageServer::start("web"), start("traces"));
     visit(&mut browser, &server, "");
     for (folder, least) in [("traces", 100), ("views", 40)] {
         let files = traces(folder);
@@ -79,7 +80,7 @@ fn recorded_episodes_replay_without_a_difference() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn every_environment_is_played_with_the_keyboard() {
-    let (server, mut browser) = (PageServer::start(), start("keyboard"));
+    let (server, mut browser) = (PageServer::start("web"), start("keyboard"));
     for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=3", spec.id));
         assert_eq!(browser.value(STATE)["id"], spec.id);
@@ -110,7 +111,7 @@ fn every_environment_is_played_with_the_keyboard() {
         let same = |canvas: &str, picture: &str| {
             format!(
                 "(() => {{ const a = document.getElementById('{canvas}').getContext('2d').getImageData(0, 0, 84, 84).data; \
-                 const b = endless.engine.{picture}().data; return a.every((byte, i) => byte === b[i]) }})()"
+                 const b = endless.engine.{picture}(endless.play.spec.frame).data; return a.every((byte, i) => byte === b[i]) }})()"
             )
         };
         assert_eq!(browser.value(&same("observation", "observation")), true, "{}", spec.id);
@@ -128,13 +129,13 @@ fn every_environment_is_played_with_the_keyboard() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn an_address_names_an_episode() {
-    let (server, mut browser) = (PageServer::start(), start("address"));
+    let (server, mut browser) = (PageServer::start("web"), start("address"));
     let link = "env=SearingSpotlights-v0&seed=18446744073709551615&num_coins=%5B3%5D&agent_visible=true";
     let mut pictures = Vec::new();
     for _ in 0..2 {
         visit(&mut browser, &server, link);
         browser.value("for (let step = 0; step < 20; step += 1) endless.play.oneStep()");
-        pictures.push(browser.value("Array.from(endless.engine.observation().data)"));
+        pictures.push(browser.value("Array.from(endless.engine.observation(endless.play.spec.frame).data)"));
         let state = browser.value(STATE);
         assert_eq!(state["options"], json!({"num_coins": "[3]", "agent_visible": "true"}));
         assert_eq!(state["seed"], "18446744073709551615");
@@ -166,7 +167,7 @@ fn an_address_names_an_episode() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn the_form_shows_the_engines_parameter_table() {
-    let (server, mut browser) = (PageServer::start(), start("form"));
+    let (server, mut browser) = (PageServer::start("web"), start("form"));
     for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
         let names = browser.value("[...document.querySelectorAll('#fields input')].map((input) => input.name)");
@@ -204,7 +205,7 @@ fn the_form_shows_the_engines_parameter_table() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn a_played_episode_is_saved_verified_and_opened() {
-    let (server, mut browser) = (PageServer::start(), start("recording"));
+    let (server, mut browser) = (PageServer::start("web"), start("recording"));
     visit(&mut browser, &server, "env=MysteryPath-v0&seed=5&show_goal=true");
     browser.value("document.getElementById('pace').value = 100; endless.play.setPace(100)");
     for (code, steps) in [("ArrowRight", 15), ("KeyS", 30)] {
@@ -244,7 +245,7 @@ fn a_played_episode_is_saved_verified_and_opened() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn experts_and_walls_play_by_themselves() {
-    let (server, mut browser) = (PageServer::start(), start("experts"));
+    let (server, mut browser) = (PageServer::start("web"), start("experts"));
     for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=2", spec.id));
         browser.value("endless.play.setPace(10000)");
@@ -269,7 +270,7 @@ fn experts_and_walls_play_by_themselves() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn a_phone_plays_by_touch() {
-    let (server, mut browser) = (PageServer::start(), start("phone"));
+    let (server, mut browser) = (PageServer::start("web"), start("phone"));
     browser.resize(390, 844, true);
     visit(&mut browser, &server, "env=Endless-SearingSpotlights-v0&seed=1");
     browser.touch("touchStart", "#pad [data-directions='right up']");
@@ -283,7 +284,7 @@ fn a_phone_plays_by_touch() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn nothing_jumps_while_loading_and_nothing_is_cut_off() {
-    let (server, mut browser) = (PageServer::start(), start("layout"));
+    let (server, mut browser) = (PageServer::start("web"), start("layout"));
     // The sum of layout shifts, as browsers measure them.
     let shifts = "new Promise((done) => { let sum = 0; const observer = new PerformanceObserver((list) => { \
                   for (const entry of list.getEntries()) sum += entry.value; }); \
@@ -307,7 +308,7 @@ fn nothing_jumps_while_loading_and_nothing_is_cut_off() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn the_page_works_offline_once_loaded() {
-    let (server, mut browser) = (PageServer::start(), start("offline"));
+    let (server, mut browser) = (PageServer::start("web"), start("offline"));
     visit(&mut browser, &server, "env=MysteryPath-v0&seed=1");
     browser.value("navigator.serviceWorker.ready.then(() => true)");
     browser.wait("navigator.serviceWorker.controller");
@@ -324,7 +325,7 @@ fn the_page_works_offline_once_loaded() {
 #[test]
 #[ignore = "needs the built page and Chromium"]
 fn every_control_has_a_name_and_is_reached_by_the_keyboard() {
-    let (server, mut browser) = (PageServer::start(), start("controls"));
+    let (server, mut browser) = (PageServer::start("web"), start("controls"));
     visit(&mut browser, &server, "env=SearingSpotlights-v0&seed=1");
     browser.value("document.querySelectorAll('details').forEach((details) => (details.open = true))");
     let tree = browser.call("Accessibility.getFullAXTree", &json!({}));

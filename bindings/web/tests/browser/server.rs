@@ -14,11 +14,15 @@ pub struct PageServer {
 }
 
 impl PageServer {
-    /// Serves the page built by `cargo xtask web`.
-    pub fn start() -> Self {
-        // The page is next to the folder for temporary test files.
-        let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).with_file_name("web");
-        assert!(folder.join("index.html").exists(), "{} is not built; cargo xtask web", folder.display());
+    /// Serves a page that `cargo xtask test --only browser` builds: `web`, or `own/site` with environments of one's own.
+    pub fn start(page: &str) -> Self {
+        // The pages are next to the folder for temporary test files.
+        let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).with_file_name(page);
+        assert!(
+            folder.join("index.html").exists(),
+            "{} is not built; cargo xtask test --only browser",
+            folder.display()
+        );
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let (address, stopped) = (listener.local_addr().unwrap(), Arc::new(AtomicBool::new(false)));
         let stop = Arc::clone(&stopped);

@@ -1,4 +1,4 @@
-//! Environments for Endless Gym: a library, a program and a Python package.
+//! Environments for Endless Gym: a library, a program, a Python package and the engine of a page.
 
 mod task;
 
@@ -12,6 +12,9 @@ pub fn registry() -> Result<Registry, RegistryError> {
 
 #[cfg(feature = "python")]
 endless_gym_python::module!(_native, registry());
+
+#[cfg(target_arch = "wasm32")]
+endless_gym_web::module!(registry());
 
 /// The tests check that a step does not allocate.
 #[cfg(test)]

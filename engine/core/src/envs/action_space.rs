@@ -6,6 +6,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::random::Generator;
+
 /// Action space of an environment, named after Gymnasium's spaces. In JSON, `{"Discrete": 4}`, `{"MultiDiscrete": [3, 3]}` or
 /// `{"Box": {"low": [-2.0], "high": [2.0]}}`, where null is an infinite bound.
 ///
@@ -87,6 +89,17 @@ impl ActionSpace {
         match actions.chunks_exact(width.max(1)).enumerate().find(|(_, action)| !fits(action)) {
             None => Ok(()),
             Some((env, action)) => Err(ActionError::Range { env, given: self.shown(action), space: self.to_string() }),
+        }
+    }
+
+    /// A uniformly random action. Bounds of a box beyond -1000 and 1000 count as these.
+    pub fn sample(&self, random: &mut Generator) -> Vec<i32> {
+        match self {
+            ActionSpace::Box { low, high } => {
+                let bounds = low.iter().zip(high.iter()).map(|(low, high)| (low.max(-1e3), high.min(1e3)));
+                bounds.map(|(low, high)| (low + random.random_f32() * (high - low)).to_bits().cast_signed()).collect()
+            }
+            _ => self.branches().iter().map(|choices| random.integers(0, i64::from(*choices)) as i32).collect(),
         }
     }
 

@@ -7,7 +7,6 @@ import { Play } from "./play.js";
 import { Wall } from "./wall.js";
 
 const $ = (id) => document.getElementById(id);
-const FIRST = "MortarMayhem-v0";
 
 function say(text, isNote = false) {
   $("message").textContent = text;
@@ -24,6 +23,7 @@ class App {
   constructor(engine) {
     this.engine = engine;
     this.specs = engine.request("specs");
+    this.first = this.specs[0].id;
     this.form = new ParameterForm($("fields"), (options) => engine.request({ check: { id: $("environment").value, options } }));
     this.play = new Play(engine, this.specs, { changed: (state) => this.#playing(state), report });
     this.wall = new Wall(engine, this.specs, {
@@ -32,6 +32,8 @@ class App {
       report,
     });
     this.#environments();
+    $("to-wall").disabled = this.specs.every((spec) => !spec.frame);
+    $("agent").hidden = this.specs.every((spec) => !this.play.agents.has(spec.id));
     this.#listen();
   }
 
@@ -39,7 +41,7 @@ class App {
   follow() {
     const link = readLink(location.hash);
     if (link.wall !== undefined) return this.showWall(link);
-    const episode = { id: link.id ?? FIRST, options: link.options, seed: link.seed ?? randomSeed() };
+    const episode = { id: link.id ?? this.first, options: link.options, seed: link.seed ?? randomSeed() };
     this.start(episode);
     if (!$("message").hidden) return;
     if (link.by === "agent") this.play.playAgent(episode);
@@ -55,7 +57,7 @@ class App {
       this.play.start(episode);
     } catch (error) {
       report(error);
-      if (!this.play.state) this.play.start({ id: FIRST, options: {}, seed: randomSeed() });
+      if (!this.play.state) this.play.start({ id: this.first, options: {}, seed: randomSeed() });
     }
   }
 
@@ -74,7 +76,7 @@ class App {
 
   #allOption(wanted) {
     const all = $("environment").querySelector("[value=all]");
-    if (wanted && !all) $("environment").prepend(Object.assign(document.createElement("option"), { value: "all", textContent: "All ten" }));
+    if (wanted && !all) $("environment").prepend(Object.assign(document.createElement("option"), { value: "all", textContent: "All" }));
     if (!wanted) all?.remove();
   }
 
@@ -110,7 +112,7 @@ class App {
   #listen() {
     addEventListener("hashchange", () => this.follow());
     $("to-play").addEventListener("click", () => {
-      const id = this.wall.id && this.wall.id !== "all" ? this.wall.id : this.play.state?.id ?? FIRST;
+      const id = this.wall.id && this.wall.id !== "all" ? this.wall.id : this.play.state?.id ?? this.first;
       if (this.play.state?.id !== id) return this.start({ id, options: {}, seed: randomSeed() });
       this.#view("play");
       this.#playing(this.play.state);

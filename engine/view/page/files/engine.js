@@ -14,7 +14,9 @@ export class Engine {
     const response = await fetch(url);
     if (!response.ok) throw new EngineError(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
     const { instance } = await WebAssembly.instantiate(await response.arrayBuffer());
-    return new Engine(instance.exports);
+    const engine = new Engine(instance.exports);
+    engine.#reply(() => instance.exports.environments());
+    return engine;
   }
 
   constructor(wasm) {
@@ -44,14 +46,14 @@ export class Engine {
     return this.#reply(() => this.#wasm.step_wall(count));
   }
 
-  /** The game's observation, as a picture of 84x84. */
-  observation() {
-    return this.#picture(this.#wasm.observation(), 84, 84);
+  /** The game's observation, as a picture of the size of its environment's frame. */
+  observation({ width, height }) {
+    return this.#picture(this.#wasm.observation(), width, height);
   }
 
-  /** The game's ground-truth view, as a picture of 84x84. */
-  view() {
-    return this.#picture(this.#wasm.view(), 84, 84);
+  /** The game's ground-truth view, as a picture of the size of its environment's frame. */
+  view({ width, height }) {
+    return this.#picture(this.#wasm.view(), width, height);
   }
 
   /** The wall, as a picture of the size in the answer to the wall's request. */

@@ -1,22 +1,17 @@
 // The episode on the screen: its player, its pace, and its display.
 
 import { Agents } from "./agents.js";
+import { ActionControls } from "./controls.js";
 import { flash } from "./flash.js";
 import { Directions, isTyping } from "./keys.js";
 import { showMemory } from "./memory.js";
 import { Pace } from "./pace.js";
 import { enable, tone } from "./sound.js";
-import { actionFor, commandsOf, directionsOf, outcomeOf, steering, TASKS } from "./tasks.js";
+import { actionFor, actionText, choiceName, commandsOf, outcomeOf, steering, TASKS, waits } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 
-const PADS = {
-  8: [["left up", "↖"], ["up", "↑"], ["right up", "↗"], ["left", "←"], null, ["right", "→"], ["left down", "↙"], ["down", "↓"], ["right down", "↘"]],
-  turn: [null, ["up", "↑"], null, ["left", "↺"], null, ["right", "↻"], null, null, null],
-  ahead: [null, ["up", "↑"], null, null, null, ["right", "→"], null, ["down", "↓"], null],
-};
-
-const DIRECTION_SIGNS = { left: "←", right: "→", up: "↑", down: "↓" };
+const PAD = [["left up", "↖"], ["up", "↑"], ["right up", "↗"], ["left", "←"], null, ["right", "→"], ["left down", "↙"], ["down", "↓"], ["right down", "↘"]];
 
 const STEP_REQUESTS = { expert: "step_of_expert", agent: "step_of_agent", trace: "step_of_trace" };
 
@@ -40,6 +35,7 @@ export class Play {
     this.agents = new Agents(engine);
     this.directions = new Directions(() => this.#takeOver());
     this.directions.attach($("pad"));
+    this.controls = new ActionControls($("action"));
     this.pace = new Pace(25, (count) => this.#steps(count));
     this.active = true;
     this.#listen();
@@ -119,7 +115,7 @@ export class Play {
 
   /** Starts or stops the expert, which must see an episode from its start. */
   toggleExpert() {
-    if (!this.state) return;
+    if (!this.spec?.has_expert) return;
     if (this.player === "expert") {
       this.player = "person";
       this.changed(this.state);
@@ -155,11 +151,24 @@ export class Play {
     if (other) {
       $("task").textContent = TASKS[state.id] ?? this.spec.summary;
       this.#pad();
+      this.controls.show(this.spec);
+      this.#frame(this.spec.frame);
       this.#originalPace();
     }
     this.changed(state);
     this.#show();
     $("view").setAttribute("aria-label", `Ground truth of ${state.id}`);
+  }
+
+  /** Gives the canvases the size of a frame, or shows features instead. */
+  #frame(frame) {
+    const { width, height } = frame ?? { width: 84, height: 84 };
+    for (const canvas of [$("observation"), $("view")]) Object.assign(canvas, { width, height });
+    const style = document.documentElement.style;
+    for (const [name, value] of Object.entries({ width, height, side: Math.max(width, height) })) style.setProperty(`--frame-${name}`, value);
+    $("view").closest("figure").hidden = !frame;
+    $("observation").hidden = !frame;
+    $("features").hidden = Boolean(frame);
   }
 
   #originalPace() {
@@ -186,7 +195,9 @@ export class Play {
     this.#attempt(() => {
       for (let step = 0; step < count && !this.#over(); step += 1) {
         const by = STEP_REQUESTS[this.player];
-        this.state = this.engine.request(by ?? { step: { action: actionFor(this.spec, this.directions.take()) } });
+        const directions = this.directions.take();
+        if (!by && !single && directions.length === 0 && waits(this.spec)) break;
+        this.state = this.engine.request(by ?? { step: { action: actionFor(this.spec, directions, this.controls.action()) } });
         this.#sound();
         this.#flash();
         if (this.player === "agent" && this.state.done) this.agents.count(this.state, outcomeOf(this.state) === "success");
@@ -227,17 +238,27 @@ export class Play {
   #show() {
     const { state, spec } = this;
     if (!state) return;
-    $("observation").getContext("2d").putImageData(this.engine.observation(), 0, 0);
-    $("view").getContext("2d").putImageData(this.engine.view(), 0, 0);
-    this.#numbers();
-    const { arrows, words } = commandsOf(state.vector);
-    $("commands").hidden = state.vector.length === 0;
+    if (spec.frame) {
+      $("observation").getContext("2d").putImageData(this.engine.observation(spec.frame), 0, 0);
+      $("view").getContext("2d").putImageData(this.engine.view(spec.frame), 0, 0);
+    } else {
+      showNumbers($("features"), spec.features.map(({ name }, index) => ({ name, value: state.features[index] })));
+    }
+    showNumbers($("numbers"), [
+      { name: "steps", value: state.length },
+      { name: "last reward", value: state.reward },
+      { name: "return", value: state.return },
+      ...state.progress,
+    ]);
+    const { arrows, words } = commandsOf(state);
+    $("commands").hidden = arrows === "";
     $("arrows").textContent = arrows;
     $("words").textContent = words;
     const running = this.pace.running;
     $("pause").textContent = running ? "Pause" : state.length === 0 ? "Start" : "Continue";
     $("pause").disabled = $("step").disabled = this.#over();
     $("expert").setAttribute("aria-pressed", String(this.player === "expert"));
+    $("expert").disabled = !spec.has_expert;
     this.#agent();
     $("status").textContent = this.#said(spec, state);
     const overlay = this.#overlay();
@@ -258,8 +279,7 @@ export class Play {
   }
 
   #said(spec, state) {
-    const signs = directionsOf(spec, state.action).map((direction) => DIRECTION_SIGNS[direction]).join(" ") || "nothing";
-    const action = state.length > 0 ? `last action ${signs}` : "no step yet";
+    const action = state.length > 0 ? `last action ${actionText(spec, state.action)}` : "no step yet";
     if (this.player === "expert") return `The expert plays; ${action}. A direction key takes over.`;
     if (this.player === "agent") return `The agent plays; ${action}. A direction key takes over.`;
     if (this.player === "trace") {
@@ -277,44 +297,23 @@ export class Play {
     }
     if (this.#over()) return "The recording ends here.";
     if (state.length === 0 && !this.pace.running) {
-      return this.player === "trace" ? `${GO} replays the recording.` : `A direction starts, or ${TOUCH ? "a tap" : "Space"}.`;
+      if (this.player === "trace") return `${GO} replays the recording.`;
+      if (Object.keys(steering(this.spec)).length === 0) return `${GO} starts.`;
+      return `A direction starts, or ${TOUCH ? "a tap" : "Space"}.`;
     }
     return this.pace.running ? "" : `Paused. ${GO} continues.`;
   }
 
-  #numbers() {
-    const { state } = this;
-    const rows = [
-      { name: "steps", value: state.length },
-      { name: "last reward", value: round(state.reward) },
-      { name: "return", value: round(state.return) },
-      ...state.progress,
-    ];
-    const list = $("numbers");
-    const names = rows.map((row) => row.name).join();
-    if (list.dataset.names !== names) {
-      list.dataset.names = names;
-      list.replaceChildren(...rows.map(({ name, of }) => {
-        const item = document.createElement("div");
-        item.append(Object.assign(document.createElement("dt"), { textContent: name }), document.createElement("dd"));
-        if (of != null) item.append(Object.assign(document.createElement("progress"), { ariaLabel: name }));
-        return item;
-      }));
-    }
-    rows.forEach(({ value, of }, index) => {
-      const [, number, bar] = list.children[index].children;
-      number.textContent = of == null ? round(value) : `${round(value)} of ${round(of)}`;
-      if (bar) Object.assign(bar, { max: Math.max(of, 1e-9), value: Math.min(Math.max(value, 0), of) });
-    });
-  }
-
   #pad() {
     const meaning = steering(this.spec);
-    const kind = this.spec.action_branches.length === 2 ? 8 : "left" in meaning ? "turn" : "ahead";
-    $("pad").replaceChildren(...PADS[kind].map((entry) => {
-      if (!entry) return document.createElement("span");
+    const turns = meaning.up !== undefined && choiceName(this.spec, ...meaning.up) === "ahead";
+    const signs = turns ? { left: "↺", right: "↻" } : {};
+    $("pad").replaceChildren(...PAD.map((entry) => {
+      const branches = entry?.[0].split(" ").map((direction) => meaning[direction]?.[0]) ?? [];
+      // Two directions need two branches.
+      if (!entry || branches.includes(undefined) || new Set(branches).size < branches.length) return document.createElement("span");
       const [directions, sign] = entry;
-      const button = Object.assign(document.createElement("button"), { type: "button", textContent: sign, ariaLabel: directions });
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: signs[directions] ?? sign, ariaLabel: directions });
       button.dataset.directions = directions;
       return button;
     }));
@@ -322,7 +321,7 @@ export class Play {
 
   #listen() {
     $("pause").addEventListener("click", () => (this.pace.running ? this.stop() : this.play()));
-    $("observation").addEventListener("click", () => (this.pace.running ? this.stop() : this.play()));
+    $("observation").parentElement.addEventListener("click", () => (this.pace.running ? this.stop() : this.play()));
     $("step").addEventListener("click", () => this.oneStep());
     $("restart").addEventListener("click", () => this.restart());
     $("next").addEventListener("click", () => this.otherSeed(1));
@@ -354,6 +353,25 @@ export class Play {
       action();
     });
   }
+}
+
+/** Shows rows `{ name, value, of }` in a list, with a bar where there is a total. */
+function showNumbers(list, rows) {
+  const names = rows.map((row) => row.name).join();
+  if (list.dataset.names !== names) {
+    list.dataset.names = names;
+    list.replaceChildren(...rows.map(({ name, of }) => {
+      const item = document.createElement("div");
+      item.append(Object.assign(document.createElement("dt"), { textContent: name }), document.createElement("dd"));
+      if (of != null) item.append(Object.assign(document.createElement("progress"), { ariaLabel: name }));
+      return item;
+    }));
+  }
+  rows.forEach(({ value, of }, index) => {
+    const [, number, bar] = list.children[index].children;
+    number.textContent = of == null ? round(value) : `${round(value)} of ${round(of)}`;
+    if (bar) Object.assign(bar, { max: Math.max(of, 1e-9), value: Math.min(Math.max(value, 0), of) });
+  });
 }
 
 /** A number with at most three decimals. */

@@ -29,19 +29,35 @@ export const TASKS = {
     "Collect one coin after the other; each is visible for a moment only. Spotlights cost health, and time runs out without a coin.",
 };
 
-const FREE = { left: [0, 1], right: [0, 2], up: [1, 1], down: [1, 2] };
-const TURN = { left: [0, 1], right: [0, 2], up: [0, 3] };
-const AHEAD = { right: [0, 1], up: [0, 2], down: [0, 3] };
+const DIRECTION_NAMES = { left: ["left"], right: ["right"], up: ["up", "ahead"], down: ["down"] };
+const DIRECTION_SIGNS = { left: "←", right: "→", up: "↑", down: "↓" };
 
-/** For each direction that the environment has: the branch of the action and its number. */
+/** For each direction that a choice of the environment is named after: the branch of the action and its number. */
 export function steering(spec) {
-  if (spec.id === "Endless-MysteryPath-v0") return AHEAD;
-  return spec.action_branches.length === 2 ? FREE : TURN;
+  const meaning = {};
+  for (const [direction, names] of Object.entries(DIRECTION_NAMES)) {
+    spec.actions.forEach(({ choices }, branch) => {
+      const number = choices.findIndex(({ name }) => names.includes(name));
+      if (number >= 0) meaning[direction] ??= [branch, number];
+    });
+  }
+  return meaning;
 }
 
-/** The action for directions; the last direction of a branch counts. */
-export function actionFor(spec, directions) {
-  const action = spec.action_branches.map(() => 0);
+/** The numbers of a branch that neither a direction nor doing nothing, which is 0, stands for. */
+export function unsteered(spec, branch) {
+  const steered = new Set(Object.values(steering(spec)).filter(([other]) => other === branch).map(([, number]) => number));
+  return Array.from({ length: spec.action_branches[branch] - 1 }, (_, index) => index + 1).filter((number) => !steered.has(number));
+}
+
+/** What a number of a branch means. */
+export function choiceName(spec, branch, number) {
+  return spec.actions[branch]?.choices[number]?.name ?? String(number);
+}
+
+/** The action for directions; the last direction of a branch counts. Without any, a branch has its number in `given`. */
+export function actionFor(spec, directions, given) {
+  const action = [...given];
   const meaning = steering(spec);
   for (const direction of directions) {
     if (meaning[direction]) action[meaning[direction][0]] = meaning[direction][1];
@@ -49,10 +65,31 @@ export function actionFor(spec, directions) {
   return action;
 }
 
-/** The directions that an action stands for. */
-export function directionsOf(spec, action) {
+/** Whether every choice is a direction, so that a person who presses none does not act. */
+export function waits(spec) {
+  return Object.values(steering(spec)).some(([, number]) => number === 0);
+}
+
+/** An action in a few signs and words. */
+export function actionText(spec, action) {
+  if (spec.action_space.Box) return [...boxNumbers(action)].map((number) => number.toPrecision(3)).join(", ");
   const meaning = Object.entries(steering(spec));
-  return meaning.filter(([, [branch, number]]) => action[branch] === number).map(([direction]) => direction);
+  const sign = (number, branch) => {
+    const direction = meaning.find(([, [steered, meant]]) => steered === branch && meant === number)?.[0];
+    if (direction) return DIRECTION_SIGNS[direction];
+    return number === 0 && unsteered(spec, branch).length === 0 ? "" : choiceName(spec, branch, number);
+  };
+  return action.map(sign).filter(Boolean).join(" ") || "nothing";
+}
+
+/** The numbers of an action in a box, whose bits the engine takes as integers. */
+export function boxNumbers(action) {
+  return new Float32Array(Int32Array.from(action).buffer);
+}
+
+/** The action in a box with these numbers. */
+export function boxAction(numbers) {
+  return [...new Int32Array(Float32Array.from(numbers).buffer)];
 }
 
 // In the order of the vector observation.
@@ -73,10 +110,10 @@ export function outcomeOf(state) {
   return state.info.success === 1 && complete ? "success" : "failure";
 }
 
-/** The commands of a vector observation, as arrows and as words. */
-export function commandsOf(vector) {
+/** The commands in the vector observation of MortarMayhemB, as arrows and as words. */
+export function commandsOf({ id, vector }) {
   const commands = [];
-  for (let start = 0; start < vector.length; start += COMMANDS.length) {
+  for (let start = 0; id.startsWith("MortarMayhemB") && start < vector.length; start += COMMANDS.length) {
     const place = vector.slice(start, start + COMMANDS.length).indexOf(1);
     if (place >= 0) commands.push(COMMANDS[place]);
   }

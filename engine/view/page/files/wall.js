@@ -29,13 +29,15 @@ export class Wall {
 
   /** Starts a wall of the environment `wall`, or of all of them. */
   start({ wall, count, by }) {
-    const ids = wall === "all" ? this.specs.map((spec) => spec.id) : [wall];
+    const ids = wall === "all" ? this.specs.filter((spec) => spec.frame).map((spec) => spec.id) : [wall];
     const options = [...$("wall-count").options].map((option) => option.value);
     const number = options.includes(count) ? Number(count) : 100;
-    const expert = by !== "random";
+    const hasExpert = this.specs.some((spec) => ids.includes(spec.id) && spec.has_expert);
+    const expert = by !== "random" && hasExpert;
     $("wall-count").value = String(number);
+    $("wall-by").disabled = !hasExpert;
     $("wall-by").value = expert ? "expert" : "random";
-    const groups = ids.map((id) => ({ id, num_envs: number / ids.length, options: {} }));
+    const groups = ids.map((id) => ({ id, num_envs: Math.max(1, Math.floor(number / ids.length)), options: {} }));
     const columns = number > 100 ? 25 : 10;
     try {
       this.state = this.engine.request({ wall: { groups, columns, expert, seed: "0" } });
@@ -43,7 +45,7 @@ export class Wall {
       return this.report(error);
     }
     this.id = wall;
-    this.number = number;
+    this.number = groups.reduce((sum, group) => sum + group.num_envs, 0);
     this.changed({ wall, count: String(number), by: expert ? "expert" : "random" });
     Object.assign($("picture"), { width: this.state.width, height: this.state.height });
     this.resume();

@@ -1,11 +1,18 @@
-//! The files of the web page that plays the environments, for programs that serve it.
+//! The files of the web page that plays environments, for programs that serve or write it.
 //!
-//! `cargo xtask web` builds the page, with the engine as WebAssembly, into this package's folder `built`. Later release
-//! builds of this crate contain it. Other builds contain only the page's sources, from which other pages take style and
-//! icon.
+//! `cargo xtask web` builds the engine with the environments of Memory Gym as WebAssembly into this package's folder `built`.
+//! Later release builds of this crate contain it. Other builds contain only the other files.
 
 /// Names and contents of the files.
 pub const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
+
+const ENGINE: &str = "engine.wasm";
+
+/// The service worker, which lacks the list of the files that it caches.
+const WORKER: &str = "worker.js";
+
+/// The end of the name of a trained agent's file, after the id of its environment.
+const AGENT: &str = ".agent.bin";
 
 /// The file of that name, such as `index.html`.
 ///
@@ -17,7 +24,29 @@ pub fn file(name: &str) -> Option<&'static [u8]> {
     FILES.iter().find_map(|(other, bytes)| (*other == name).then_some(*bytes))
 }
 
-/// Whether the page was built before this crate and so can be played.
+/// Whether the engine was built before this crate, so that the page can be played.
 pub fn is_built() -> bool {
-    file("engine.wasm").is_some()
+    file(ENGINE).is_some()
+}
+
+/// Names and contents of all files of a page with another engine, for any web server. `has_id` says whether the engine has an
+/// environment: agents of others are left out.
+///
+/// ```
+/// let files = endless_gym_page::files(b"\0asm", |_| false);
+/// let (_, worker) = files.iter().find(|(name, _)| *name == "worker.js").unwrap();
+/// assert!(worker.starts_with(b"const VERSION = \""));
+/// ```
+pub fn files(engine: &[u8], has_id: impl Fn(&str) -> bool) -> Vec<(&'static str, Vec<u8>)> {
+    let is_kept = |name: &str| name != ENGINE && name.strip_suffix(AGENT).is_none_or(&has_id);
+    let sources = FILES.iter().filter(|(name, _)| is_kept(name)).copied();
+    let mut files: Vec<_> = sources.chain([(ENGINE, engine)]).map(|(name, bytes)| (name, bytes.to_vec())).collect();
+    let mut checksum = crc32fast::Hasher::new();
+    files.iter().for_each(|(_, bytes)| checksum.update(bytes));
+    let names: Vec<&str> = files.iter().map(|(name, _)| *name).filter(|name| *name != WORKER).collect();
+    let lines = format!("const VERSION = \"{:08x}\";\nconst FILES = {names:?};\n", checksum.finalize());
+    for (_, worker) in files.iter_mut().filter(|(name, _)| *name == WORKER) {
+        worker.splice(0..0, lines.bytes());
+    }
+    files
 }

@@ -1,0 +1,56 @@
+//! Tests the page with environments of one's own, those of `tests/own/lib.rs`, which `endless page` writes.
+
+use serde_json::json;
+
+use crate::server::PageServer;
+use crate::{STATE, start, visit};
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn environments_of_ones_own_are_played() {
+    let (server, mut browser) = (PageServer::start("own/site"), start("own"));
+    let text = |id: &str| format!("document.getElementById('{id}').innerText");
+    // The first environment is shown, without trained agents, which are of other environments.
+    visit(&mut browser, &server, "");
+    assert_eq!(browser.value(STATE)["id"], "Small-v0");
+    let shown = browser.value("['agent', 'action', 'features'].map((id) => !document.getElementById(id).hidden)");
+    assert_eq!(shown, json!([false, true, false]));
+    browser.value("document.querySelector('#action select').value = '3'");
+    browser.press("KeyN");
+    assert_eq!(browser.value(STATE)["action"], json!([3]));
+    // The square has moved to column 3.
+    let pixels = "['observation', 'view'].map((id) => { const canvas = document.getElementById(id); \
+                  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height); \
+                  return [canvas.width, canvas.height, data.indexOf(200)] })";
+    assert_eq!(browser.value(pixels), json!([[12, 12, 12], [12, 12, 12]]));
+
+    visit(&mut browser, &server, "env=Numbers-v0&seed=1");
+    browser.value("document.querySelector('#action select').value = '4'");
+    browser.key("rawKeyDown", "ArrowRight");
+    browser.wait(&format!("{STATE}.done"));
+    browser.key("keyUp", "ArrowRight");
+    assert_eq!(browser.value(STATE)["action"], json!([2, 4]));
+    assert_eq!(browser.value(&text("features")), "move\n2\nlamp\n4");
+    assert!(browser.value(&text("status")).as_str().unwrap().contains("last action → white"));
+    assert!(browser.value(&text("overlay")).as_str().unwrap().starts_with("Episode over: return 5 in 5 steps"));
+
+    visit(&mut browser, &server, "env=Slider-v0&seed=1");
+    let kinds = "[...document.querySelectorAll('#action input')].map((input) => [input.type, input.min, input.max])";
+    assert_eq!(browser.value(kinds), json!([["range", "-1", "2"], ["number", "", ""]]));
+    browser
+        .value("[...document.querySelectorAll('#action input')].forEach((input, i) => (input.value = [0.5, -700][i]))");
+    browser.press("KeyN");
+    assert!(browser.value(&text("status")).as_str().unwrap().contains("last action 0.500, -700"));
+    assert_eq!(browser.value(pixels), json!([[20, 8, (2 * 20 + 5) * 4], [20, 8, (2 * 20 + 5) * 4]]));
+    let sides =
+        "['width', 'height'].map((side) => document.querySelector('.agent .screen').getBoundingClientRect()[side])";
+    let sides = browser.value(sides);
+    assert_eq!(sides[0].as_f64().unwrap() / sides[1].as_f64().unwrap(), 20.0 / 8.0);
+
+    visit(&mut browser, &server, "wall=all&count=10");
+    assert_eq!(browser.value("endless.wall.state.groups.map((group) => group.id)"), json!(["Small-v0", "Slider-v0"]));
+    browser.wait("endless.wall.state.groups.every((group) => group.episodes > 0)");
+    assert_eq!(browser.complaints, Vec::<String>::new());
+    // The page works offline.
+    assert_eq!(browser.value("navigator.serviceWorker.ready.then(() => true)"), true);
+}
