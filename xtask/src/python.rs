@@ -59,10 +59,6 @@ pub fn uv(arguments: &[&str]) -> Result<Command, String> {
     Ok(uv)
 }
 
-fn python_of(environment: &Path) -> PathBuf {
-    environment.join("bin/python")
-}
-
 fn venv_folder(name: &str) -> Result<PathBuf, String> {
     Ok(target()?.join("venvs").join(name))
 }
@@ -193,12 +189,12 @@ pub fn test_libraries(crates: PathBuf) -> Result<(), String> {
     let gymnasiums = ["1.1.0", "1.2.3"].map(|version| {
         let packages = [&format!("gymnasium=={version}"), "numpy==2.4.6"];
         let folder = tools(&format!("gymnasium-{version}"), &base()?, &packages)?;
-        Ok::<_, String>(format!("{version}={}", python_of(&folder).display()))
+        Ok::<_, String>(format!("{version}={}", folder.join("bin/python").display()))
     });
     let gymnasiums = gymnasiums.into_iter().collect::<Result<Vec<_>, _>>()?.join(":");
     let paths = [
         ("ENDLESS_CRATES", crates),
-        ("ENDLESS_LIBRARIES_PYTHON", python_of(&rllib)),
+        ("ENDLESS_LIBRARIES_PYTHON", rllib.join("bin/python")),
         ("ENDLESS_GYMNASIUM_PYTHONS", gymnasiums.into()),
     ];
     pytest(&environment, "bindings/python", "(slow or libraries) and not original", &paths)

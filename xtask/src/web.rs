@@ -89,7 +89,8 @@ pub fn folder() -> Result<PathBuf, String> {
 /// Builds the page. Fails if there is no compiler for WebAssembly, or if the page is too large.
 pub fn build() -> Result<(), String> {
     let built = Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-web"])?;
-    let engine = read(&built.join("endless_gym_web.wasm"))?;
+    let engine = built.join("endless_gym_web.wasm");
+    let engine = fs::read(&engine).map_err(describe(&engine))?;
     let files = endless_gym_page::files(&engine, |_| true);
     write(&folder()?, &files)?;
     // The program embeds the engine from here. It is not rewritten unchanged, to avoid a rebuild.
@@ -129,7 +130,9 @@ fn build_own() -> Result<(), String> {
     let mut page = Command::new(&program);
     page.args(["page", "--manifest-path", "own/Cargo.toml"]).current_dir(&folder);
     Toolchain::find().ok_or(MISSING)?.set(&mut page)?;
-    run(&mut page)
+    // With the flags and the profile of the workspace, so that the standard library is compiled once.
+    page.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
+    run(page.env("CARGO_PROFILE_RELEASE_LTO", "thin").env("CARGO_PROFILE_RELEASE_CODEGEN_UNITS", "1"))
 }
 
 fn write(folder: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), String> {
@@ -145,8 +148,4 @@ fn compressed(bytes: &[u8]) -> usize {
     // Writing to memory does not fail.
     let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
     written.map_or(bytes.len(), |bytes| bytes.len())
-}
-
-fn read(path: &Path) -> Result<Vec<u8>, String> {
-    fs::read(path).map_err(describe(path))
 }
