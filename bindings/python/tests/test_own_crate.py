@@ -40,8 +40,9 @@ def test_the_page_leads_from_an_empty_folder_to_a_trained_agent(tmp_path: Path) 
         "PATH": f"{venv / 'bin'}:{Path(sys.executable).parent}:{os.environ['PATH']}",
         # `endless-train` belongs to the Python of the tests.
         "PYTHONPATH": f"{site}:{os.environ.get('PYTHONPATH', '')}".rstrip(":"),
-        "CARGO_TARGET_DIR": os.environ.get("CARGO_TARGET_DIR", str(ROOT / "target")),
-        # With the profile of the workspace's dependencies, which are then compiled once.
+        # Not that of the workspace: as a dependency, the binding would replace the module of the workspace's build.
+        "CARGO_TARGET_DIR": str(tmp_path / "target"),
+        "CARGO_INCREMENTAL": "0",
         "CARGO_PROFILE_DEV_DEBUG": "false",
         "MATURIN_PEP517_ARGS": "--profile dev",
         "PIP_NO_BUILD_ISOLATION": "0",
