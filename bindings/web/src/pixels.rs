@@ -39,11 +39,12 @@ mod tests {
             let shape = FrameShape { width: 7, height: 5, channels };
             let (x, y) = (5, 2);
             let mut observation = vec![0; shape.bytes()];
-            observation[(x * 5 + y) * channels..][..channels].fill(9);
+            observation[(x * 5 + y) * channels..][..channels].copy_from_slice(&[7, 8, 9, 6][..channels]);
             let mut wide = vec![0; 5 * 10 * 4];
             put_observation(&observation, shape, &mut wide, 10);
-            assert_eq!(wide[(y * 10 + x) * 4..][..4], [9, 9, 9, 255]);
-            assert_eq!(wide.iter().filter(|byte| **byte == 9).count(), 3);
+            let expected = if channels == 1 { [7, 7, 7, 255] } else { [7, 8, 9, 255] };
+            assert_eq!(wide[(y * 10 + x) * 4..][..4], expected);
+            assert_eq!(wide.iter().filter(|byte| (6..10).contains(*byte)).count(), 3);
         }
         let shape = FrameShape::rgb(7, 5);
         let mut view = Picture { width: 28, height: 20, pixels: vec![0; 28 * 20 * 3] };

@@ -2,7 +2,7 @@
 
 use clap::ValueEnum;
 use endless_gym_core::batch::Batch;
-use endless_gym_core::envs::{ActionSpace, EnvSpec};
+use endless_gym_core::envs::{ActionSpace, EnvSpec, finite_bounds};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
@@ -27,14 +27,13 @@ impl RandomPolicy {
         RandomPolicy { space: spec.action_space.clone(), random: SmallRng::seed_from_u64(seed) }
     }
 
-    /// Fills `actions`: one row per environment. Infinite bounds of a box count as -1 and 1.
+    /// Fills `actions`: one row per environment. Infinite bounds of a box are replaced by [`finite_bounds`] with a width of 1.
     pub fn act(&mut self, actions: &mut [i32]) {
         let RandomPolicy { space, random } = self;
         for action in actions.chunks_exact_mut(space.width()) {
             if let ActionSpace::Box { low, high } = space {
-                let finite = |bound: f32, other: f32| if bound.is_finite() { bound } else { other };
                 for (number, (low, high)) in action.iter_mut().zip(low.iter().zip(high.iter())) {
-                    let (low, high) = (finite(*low, -1.0), finite(*high, 1.0));
+                    let (low, high) = finite_bounds(*low, *high, 1.0);
                     *number = (low + random.random::<f32>() * (high - low)).to_bits().cast_signed();
                 }
             }

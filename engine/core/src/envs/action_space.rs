@@ -8,6 +8,17 @@ use thiserror::Error;
 
 use crate::random::Generator;
 
+/// Finite bounds within those of a box, for random numbers: an infinite one is `width` away from the other, or from 0 if both
+/// are infinite.
+pub fn finite_bounds(low: f32, high: f32, width: f32) -> (f32, f32) {
+    match (low.is_finite(), high.is_finite()) {
+        (true, true) => (low, high),
+        (true, false) => (low, low + width),
+        (false, true) => (high - width, high),
+        (false, false) => (-width, width),
+    }
+}
+
 /// Action space of an environment, named after Gymnasium's spaces. In JSON, `{"Discrete": 4}`, `{"MultiDiscrete": [3, 3]}` or
 /// `{"Box": {"low": [-2.0], "high": [2.0]}}`, where null is an infinite bound.
 ///
@@ -92,11 +103,11 @@ impl ActionSpace {
         }
     }
 
-    /// A uniformly random action. Bounds of a box beyond -1000 and 1000 count as these.
+    /// A uniformly random action. Infinite bounds of a box are replaced by [`finite_bounds`] with a width of 1000.
     pub fn sample(&self, random: &mut Generator) -> Vec<i32> {
         match self {
             ActionSpace::Box { low, high } => {
-                let bounds = low.iter().zip(high.iter()).map(|(low, high)| (low.max(-1e3), high.min(1e3)));
+                let bounds = low.iter().zip(high.iter()).map(|(low, high)| finite_bounds(*low, *high, 1e3));
                 bounds.map(|(low, high)| (low + random.random_f32() * (high - low)).to_bits().cast_signed()).collect()
             }
             _ => self.branches().iter().map(|choices| random.integers(0, i64::from(*choices)) as i32).collect(),
@@ -205,6 +216,18 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+
+    #[test]
+    fn random_numbers_are_within_the_bounds_of_a_box() {
+        const LOW: &[f32] = &[2000.0, 5.0, f32::NEG_INFINITY];
+        const HIGH: &[f32] = &[3000.0, f32::INFINITY, -5.0];
+        let (space, mut random) = (ActionSpace::bounded(LOW, HIGH), Generator::from_seed(1));
+        for _ in 0..100 {
+            let action = space.sample(&mut random);
+            let mut numbers = box_action(&action).iter().zip(LOW.iter().zip(HIGH));
+            assert!(numbers.all(|(number, (low, high))| (*low..=*high).contains(number)));
+        }
+    }
 
     #[test]
     fn spaces_survive_json() {

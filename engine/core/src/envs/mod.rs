@@ -9,7 +9,7 @@ mod spec;
 mod task;
 pub mod view;
 
-pub use action_space::{ActionError, ActionSpace, InvalidActionSpace, box_action};
+pub use action_space::{ActionError, ActionSpace, InvalidActionSpace, box_action, finite_bounds};
 pub use environment::{Environment, InvalidState, Transition};
 pub use expert::Expert;
 pub use parameters::{Parameter, ParameterError, ParameterKind, ResetParameters};
