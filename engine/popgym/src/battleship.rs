@@ -1,6 +1,8 @@
 //! Battleship: find hidden ships; a shot only says whether it hit.
 
-use endless_gym_core::envs::{ActionSpace, Column, EnvSpec, ObservationSpace, ResetParameters, Task, Transition};
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+};
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
@@ -106,5 +108,55 @@ impl Task for Battleship {
 
     fn is_valid(&self, _: &Parameters) -> bool {
         (0..=COVERED).contains(&self.hits) && self.steps >= 0
+    }
+
+    fn expert(id: &str) -> Option<Box<dyn Expert>> {
+        let size = SIZES[place(&IDS, id)];
+        Some(Box::new(Hunter { size, shots: vec![None; size * size], last: None }))
+    }
+}
+
+/// Shoots where most placements of the ships fit its shots. Each hit that a placement covers makes it [`Hunter::HIT`] times as likely.
+struct Hunter {
+    size: usize,
+    /// Whether the shot at each square hit.
+    shots: Vec<Option<bool>>,
+    last: Option<usize>,
+}
+
+impl Hunter {
+    const HIT: f64 = 6.0;
+
+    /// The squares of a ship that starts at a square, if it is on the board and no shot missed it there.
+    fn placement(&self, start: usize, ship: usize, is_vertical: bool) -> Option<Vec<usize>> {
+        let (row, column) = (start / self.size, start % self.size);
+        let fits = ship + if is_vertical { row } else { column } <= self.size;
+        let squares: Vec<usize> = (0..ship).map(|at| start + at * if is_vertical { self.size } else { 1 }).collect();
+        (fits && squares.iter().all(|square| self.shots[*square] != Some(false))).then_some(squares)
+    }
+}
+
+impl Expert for Hunter {
+    fn reset(&mut self) {
+        self.shots.fill(None);
+        self.last = None;
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        if let Some(last) = self.last {
+            self.shots[last] = Some(features[0] == 1.0);
+        }
+        let mut scores = vec![0.0; self.shots.len()];
+        for (start, ship) in (0..self.shots.len()).flat_map(|start| SHIPS.map(|ship| (start, ship as usize))) {
+            for squares in [false, true].into_iter().filter_map(|is_vertical| self.placement(start, ship, is_vertical))
+            {
+                let hits = squares.iter().filter(|square| self.shots[**square].is_some()).count();
+                squares.iter().for_each(|square| scores[*square] += Self::HIT.powi(hits as i32));
+            }
+        }
+        let open = (0..scores.len()).filter(|square| self.shots[*square].is_none());
+        let square = open.max_by(|a, b| scores[*a].total_cmp(&scores[*b])).unwrap_or_default();
+        self.last = Some(square);
+        (action[0], action[1]) = ((square / self.size) as i32, (square % self.size) as i32);
     }
 }

@@ -9,6 +9,7 @@ use endless_gym_core::envs::{
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
+use crate::filter::Filter;
 use crate::ids::{ids, place};
 
 const IDS: [[&str; 3]; 3] =
@@ -66,6 +67,20 @@ pub struct CartPole {
 }
 
 impl CartPole {
+    /// Pushes the cart. Every operation rounds as in Gymnasium.
+    fn push(&mut self, action: i32) {
+        let force = if action == 1 { FORCE } else { -FORCE };
+        let (sin, cos) = (self.angle.sin(), self.angle.cos());
+        let push = (force + POLE_MOMENT * (self.angular_velocity * self.angular_velocity) * sin) / TOTAL_MASS;
+        let angular_acceleration =
+            (GRAVITY * sin - cos * push) / (LENGTH * (4.0 / 3.0 - MASS_POLE * (cos * cos) / TOTAL_MASS));
+        let acceleration = push - POLE_MOMENT * angular_acceleration * cos / TOTAL_MASS;
+        self.x += SECONDS * self.velocity;
+        self.velocity += SECONDS * acceleration;
+        self.angle += SECONDS * self.angular_velocity;
+        self.angular_velocity += SECONDS * angular_acceleration;
+    }
+
     /// Observes two numbers, with noise.
     fn observe(&mut self, numbers: [f64; 2], parameters: &Parameters, random: &mut Generator) {
         self.observation = numbers.map(|number| number as f32);
@@ -146,17 +161,7 @@ impl Task for CartPole {
     }
 
     fn step(&mut self, parameters: &Parameters, action: &[i32], random: &mut Generator) -> Transition {
-        // Every operation rounds as in Gymnasium.
-        let force = if action[0] == 1 { FORCE } else { -FORCE };
-        let (sin, cos) = (self.angle.sin(), self.angle.cos());
-        let push = (force + POLE_MOMENT * (self.angular_velocity * self.angular_velocity) * sin) / TOTAL_MASS;
-        let angular_acceleration =
-            (GRAVITY * sin - cos * push) / (LENGTH * (4.0 / 3.0 - MASS_POLE * (cos * cos) / TOTAL_MASS));
-        let acceleration = push - POLE_MOMENT * angular_acceleration * cos / TOTAL_MASS;
-        self.x += SECONDS * self.velocity;
-        self.velocity += SECONDS * acceleration;
-        self.angle += SECONDS * self.angular_velocity;
-        self.angular_velocity += SECONDS * angular_acceleration;
+        self.push(action[0]);
         let fails = self.x < -MAX_X || self.x > MAX_X || self.angle < -MAX_ANGLE || self.angle > MAX_ANGLE;
         // Only steps after the end fail twice.
         let reward = if fails && self.has_failed { -1.0 } else { parameters.reward };
@@ -173,36 +178,59 @@ impl Task for CartPole {
     }
 
     fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        match place(&IDS.concat(), id) / 3 {
-            0 => Some(Box::new(Balance::default())),
-            1 => Some(Box::new(Balance { sees_velocities: true, ..Balance::default() })),
-            _ => None,
-        }
+        let at = place(&IDS.concat(), id);
+        Some(Box::new(Balance {
+            sees_velocities: at / 3 == 1,
+            variance: if at / 3 == 2 { DEVIATIONS[at % 3].powi(2) } else { 1e-12 },
+            estimate: CartPole::default(),
+            filters: [Filter::new(0.0, 0.0); 2],
+            last: None,
+        }))
     }
 }
 
-/// Pushes to the side to which the pole will fall. Estimates velocities from positions, or positions from velocities.
-#[derive(Default)]
+/// Pushes to the side to which the pole will fall, by what it knows of the motion and observes.
 struct Balance {
     sees_velocities: bool,
-    /// The last positions.
-    last: Option<[f64; 2]>,
+    /// Variance of observed positions.
+    variance: f64,
+    estimate: CartPole,
+    /// Of the cart, and of the pole.
+    filters: [Filter; 2],
+    /// The last action.
+    last: Option<i32>,
 }
 
 impl Expert for Balance {
     fn reset(&mut self) {
-        self.last = None;
+        // Positions and velocities are at first uniform in ±0.05.
+        let variance = 0.05 * 0.05 / 3.0;
+        (self.filters, self.last) = ([Filter::new(variance, variance); 2], None);
+        self.estimate = CartPole::default();
     }
 
     fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
-        let seen = [f64::from(features[0]), f64::from(features[1])];
+        let seen = [features[0], features[1]].map(f64::from);
+        if let Some(last) = self.last {
+            self.estimate.push(last);
+            let [cart, pole] = &mut self.filters;
+            cart.predict(0.0, SECONDS, 1.0);
+            pole.predict(GRAVITY / (LENGTH * (4.0 / 3.0 - MASS_POLE / TOTAL_MASS)), SECONDS, 1.0);
+        }
+        let CartPole { x, velocity, angle, angular_velocity, .. } = &mut self.estimate;
         // The first observation shows positions in any case.
-        let last = self.last.unwrap_or(seen);
-        let ([x, angle], [velocity, angular_velocity]) = match self.last {
-            Some(_) if self.sees_velocities => ([0, 1].map(|axis| last[axis] + SECONDS * seen[axis]), seen),
-            _ => (seen, [0, 1].map(|axis| (seen[axis] - last[axis]) / SECONDS)),
-        };
-        self.last = Some([x, angle]);
-        action[0] = i32::from(angle + 0.3 * angular_velocity + 0.02 * x + 0.05 * velocity > 0.0);
+        if self.sees_velocities && self.last.is_some() {
+            [*velocity, *angular_velocity] = seen;
+        } else {
+            let estimates = [(&mut *x, &mut *velocity), (&mut *angle, &mut *angular_velocity)];
+            for ((filter, seen), (position, velocity)) in self.filters.iter_mut().zip(seen).zip(estimates) {
+                let (error, gains) = (seen - *position, filter.correct(self.variance));
+                *position += gains[0] * error;
+                *velocity += gains[1] * error;
+            }
+        }
+        let side = *angle + 0.3 * *angular_velocity + 0.02 * *x + 0.05 * *velocity;
+        action[0] = i32::from(side > 0.0);
+        self.last = Some(action[0]);
     }
 }

@@ -1,7 +1,9 @@
 //! Labyrinth Escape and Labyrinth Explore: walk through a maze, seeing only the squares around.
 
+use std::collections::HashSet;
+
 use endless_gym_core::envs::{
-    ActionBranch, ActionSpace, Choice, Column, EnvSpec, ObservationSpace, ResetParameters, Task, Transition,
+    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
@@ -185,5 +187,125 @@ impl Task for Labyrinth {
             && self.explored.len() == size
             && self.position.row < size
             && self.position.column < size
+    }
+
+    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Walker::default()))
+    }
+}
+
+/// Depth-first search: walks into squares that it has not been on, first straight on, and back where there are none.
+#[derive(Default)]
+struct Walker {
+    /// Squares that it has been on, relative to the start.
+    explored: HashSet<[i32; 2]>,
+    /// The actions that lead from the start to its square.
+    path: Vec<i32>,
+    position: [i32; 2],
+}
+
+/// Rows and columns of the actions' moves. Actions 2n and 2n + 1 are opposite.
+const MOVES: [[i32; 2]; 4] = [[0, -1], [0, 1], [-1, 0], [1, 0]];
+
+impl Expert for Walker {
+    fn reset(&mut self) {
+        *self = Walker::default();
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        let view = &features[..VIEW];
+        self.explored.insert(self.position);
+        // Only on the start can the agent be at the view's edge.
+        let start = view.iter().position(|square| *square == START);
+        let middle = start.filter(|_| self.path.is_empty()).unwrap_or(VIEW / 2) as i32;
+        let square = |[row, column]: [i32; 2]| {
+            let (row, column) = (middle / 3 + row, middle % 3 + column);
+            if (0..3).contains(&row) && (0..3).contains(&column) { view[(3 * row + column) as usize] } else { WALL }
+        };
+        let to = |move_: i32| {
+            let [row, column] = MOVES[move_ as usize];
+            [self.position[0] + row, self.position[1] + column]
+        };
+        let last = self.path.last().copied();
+        let first = last.into_iter().chain(0..4);
+        let is_new = |move_: &i32| square(MOVES[*move_ as usize]) != WALL && !self.explored.contains(&to(*move_));
+        let goal = (0..4).find(|move_| square(MOVES[*move_ as usize]) == GOAL);
+        action[0] = match goal.or_else(|| first.into_iter().find(is_new)) {
+            Some(new) => {
+                self.position = to(new);
+                self.path.push(new);
+                new
+            }
+            None => match self.path.pop() {
+                Some(last) => {
+                    let back = last ^ 1;
+                    self.position = to(back);
+                    back
+                }
+                None => 0,
+            },
+        };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::{HashMap, VecDeque};
+
+    use super::*;
+
+    /// Steps from the start to each square of the maze, by breadth-first search.
+    fn distances(labyrinth: &Labyrinth, escapes: bool) -> HashMap<(usize, usize), usize> {
+        let key = |place: Place| (place.row, place.column);
+        let mut found = HashMap::from([(key(labyrinth.maze.start), 0)]);
+        let mut queue = VecDeque::from([labyrinth.maze.start]);
+        while let Some(from) = queue.pop_front() {
+            for action in 0..4 {
+                let to = Labyrinth { position: from, ..labyrinth.clone() }.moved(action, escapes);
+                if !found.contains_key(&key(to)) {
+                    found.insert(key(to), found[&key(from)] + 1);
+                    queue.push_back(to);
+                }
+            }
+        }
+        found
+    }
+
+    #[test]
+    fn the_expert_walks_no_way_more_than_twice() {
+        for (number, id) in IDS.concat().into_iter().enumerate() {
+            let parameters = Parameters { cells: CELLS[number % 3], escapes: number < 3 };
+            for seed in 0..50 {
+                let (mut labyrinth, mut random) = (Labyrinth::default(), Generator::from_seed(seed));
+                let mut expert = Labyrinth::expert(id).unwrap();
+                labyrinth.seed(seed);
+                labyrinth.reset(&parameters, &mut random);
+                expert.reset();
+                let distances = distances(&labyrinth, parameters.escapes);
+                let (mut features, mut action, mut total) = ([0.0; VIEW + 1], [0], 0.0);
+                let last = loop {
+                    labyrinth.features(&parameters, &mut features);
+                    expert.act(&features, &[], &mut action);
+                    let step = labyrinth.step(&parameters, &action, &mut random);
+                    total += step.reward;
+                    if step.terminated || step.truncated {
+                        break step;
+                    }
+                };
+                assert!(last.terminated, "{id}, seed {seed}");
+                let steps = labyrinth.steps as usize;
+                let Place { row, column } = labyrinth.position;
+                let shortest = distances[&(row, column)];
+                // One way leads to each square but the start.
+                let ways = distances.len() - 1;
+                if parameters.escapes {
+                    assert!((shortest..=2 * ways - shortest).contains(&steps), "{id}, seed {seed}: {steps}");
+                    assert!((total - (1.0 - steps as f64 / 1024.0)).abs() < 1e-9);
+                } else {
+                    assert_eq!(steps, 2 * ways - shortest, "{id}, seed {seed}");
+                    assert!((total - (1.0 - (steps - ways) as f64 / 1024.0)).abs() < 1e-9);
+                }
+            }
+        }
     }
 }

@@ -11,6 +11,7 @@ pub mod cart_pole;
 pub mod concentration;
 pub mod count_recall;
 mod deck;
+mod filter;
 pub mod higher_lower;
 mod ids;
 pub mod labyrinth;

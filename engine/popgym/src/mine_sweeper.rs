@@ -1,6 +1,8 @@
 //! Mine Sweeper: view all squares without a mine; a viewed square says how many mines are around it.
 
-use endless_gym_core::envs::{ActionSpace, Column, EnvSpec, ObservationSpace, ResetParameters, Task, Transition};
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+};
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
@@ -22,6 +24,26 @@ pub struct Parameters {
     viewed: f64,
     mine: f64,
     known: f64,
+}
+
+impl Parameters {
+    fn new(id: &str) -> Self {
+        let (size, mines) = VARIANTS[place(&IDS, id)];
+        let squares = size * size;
+        let near = |a: usize, b: usize| (a / size).abs_diff(b / size) <= 1 && (a % size).abs_diff(b % size) <= 1;
+        let around = |of| (0..squares).filter(|square| near(of, *square)).fold(0, |bits, square| bits | 1 << square);
+        let max_steps = squares - mines;
+        let viewed = 1.0 / max_steps as f64;
+        Parameters {
+            size,
+            mines,
+            around: (0..squares).map(around).collect(),
+            max_steps: max_steps as u32,
+            viewed,
+            mine: -0.5 - viewed,
+            known: -0.5 / (max_steps - 2) as f64,
+        }
+    }
 }
 
 /// The state of an episode. Squares are bits, row by row.
@@ -56,21 +78,7 @@ impl Task for MineSweeper {
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let (size, mines) = VARIANTS[place(&IDS, given.id())];
-        let squares = size * size;
-        let near = |a: usize, b: usize| (a / size).abs_diff(b / size) <= 1 && (a % size).abs_diff(b % size) <= 1;
-        let around = |of| (0..squares).filter(|square| near(of, *square)).fold(0, |bits, square| bits | 1 << square);
-        let max_steps = squares - mines;
-        let viewed = 1.0 / max_steps as f64;
-        Parameters {
-            size,
-            mines,
-            around: (0..squares).map(around).collect(),
-            max_steps: max_steps as u32,
-            viewed,
-            mine: -0.5 - viewed,
-            known: -0.5 / (max_steps - 2) as f64,
-        }
+        Parameters::new(given.id())
     }
 
     fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
@@ -103,5 +111,59 @@ impl Task for MineSweeper {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = self.count.into();
+    }
+
+    fn expert(id: &str) -> Option<Box<dyn Expert>> {
+        let parameters = Parameters::new(id);
+        Some(Box::new(Solver { counts: vec![None; parameters.around.len()], parameters, last: None }))
+    }
+}
+
+/// Views the square that is least likely a mine. The probabilities are fitted to all counts, one count after the other.
+struct Solver {
+    parameters: Parameters,
+    /// Mines around each viewed square.
+    counts: Vec<Option<f64>>,
+    last: Option<usize>,
+}
+
+impl Solver {
+    const ROUNDS: usize = 100;
+
+    /// Probabilities of mines.
+    fn probabilities(&self) -> Vec<f64> {
+        let squares = self.counts.len();
+        let closed = |around: u64| {
+            (0..squares).filter(move |square| around >> square & 1 == 1 && self.counts[*square].is_none())
+        };
+        let counts = self.counts.iter().zip(&self.parameters.around);
+        let mut sums: Vec<(f64, Vec<usize>)> =
+            counts.filter_map(|(count, around)| Some(((*count)?, closed(*around).collect()))).collect();
+        sums.push((self.parameters.mines as f64, closed(u64::MAX).collect()));
+        let mut mines = vec![0.5; squares];
+        for (sum, squares) in (0..Self::ROUNDS).flat_map(|_| &sums) {
+            let scale = sum / squares.iter().map(|square| mines[*square]).sum::<f64>().max(f64::MIN_POSITIVE);
+            squares.iter().for_each(|square| mines[*square] = (mines[*square] * scale).min(1.0));
+        }
+        mines
+    }
+}
+
+impl Expert for Solver {
+    fn reset(&mut self) {
+        self.counts.fill(None);
+        self.last = None;
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        if let Some(last) = self.last {
+            self.counts[last] = Some(features[0].into());
+        }
+        let mines = self.probabilities();
+        let closed = (0..mines.len()).filter(|square| self.counts[*square].is_none());
+        let square = closed.min_by(|a, b| mines[*a].total_cmp(&mines[*b])).unwrap_or_default();
+        self.last = Some(square);
+        let size = self.parameters.size;
+        (action[0], action[1]) = ((square / size) as i32, (square % size) as i32);
     }
 }

@@ -1,6 +1,8 @@
 //! Multiarmed Bandit: find the arms that pay best.
 
-use endless_gym_core::envs::{ActionSpace, Column, EnvSpec, ObservationSpace, ResetParameters, Task, Transition};
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+};
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
@@ -76,5 +78,39 @@ impl Task for MultiarmedBandit {
 
     fn is_valid(&self, _: &Parameters) -> bool {
         self.arms.iter().all(|arm| (0.0..1.0).contains(arm))
+    }
+
+    fn expert(id: &str) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Optimist { pulls: vec![[0.0; 2]; VARIANTS[place(&IDS, id)].0], last: None }))
+    }
+}
+
+/// Pulls the arm with the highest plausible probability: the posterior mean plus 1.5 standard deviations.
+struct Optimist {
+    /// How often each arm did not pay and paid.
+    pulls: Vec<[f64; 2]>,
+    last: Option<usize>,
+}
+
+impl Expert for Optimist {
+    fn reset(&mut self) {
+        self.pulls.fill([0.0; 2]);
+        self.last = None;
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        if let Some(last) = self.last {
+            self.pulls[last][usize::from(features[0] == 1.0)] += 1.0;
+        }
+        // The prior is uniform, so the posterior is a beta distribution.
+        let bound = |[unpaid, paid]: [f64; 2]| {
+            let pulls = unpaid + paid + 2.0;
+            let mean = (paid + 1.0) / pulls;
+            mean + 1.5 * (mean * (1.0 - mean) / (pulls + 1.0)).sqrt()
+        };
+        let arms = self.pulls.iter().map(|pulls| bound(*pulls)).enumerate();
+        let arm = arms.max_by(|(_, a), (_, b)| a.total_cmp(b)).map_or(0, |(arm, _)| arm);
+        self.last = Some(arm);
+        action[0] = arm as i32;
     }
 }

@@ -1,0 +1,36 @@
+//! A Kalman filter for a position or an angle whose motion is known and whose observations are noisy.
+
+/// The covariance of an estimated position and its velocity.
+#[derive(Clone, Copy, Debug)]
+pub struct Filter {
+    position: f64,
+    both: f64,
+    velocity: f64,
+}
+
+impl Filter {
+    /// The variances of independent estimates.
+    pub fn new(position: f64, velocity: f64) -> Self {
+        Filter { position, both: 0.0, velocity }
+    }
+
+    /// The estimate has moved on. `slope` is the derivative of the acceleration with respect to the position. `growth`, 1 or more,
+    /// multiplies the covariance, for motions of which the slope is an approximation.
+    pub fn predict(&mut self, slope: f64, seconds: f64, growth: f64) {
+        let Filter { position, both, velocity } = *self;
+        let turn = slope * seconds;
+        self.position = growth * (position + seconds * (2.0 * both + seconds * velocity));
+        self.both = growth * (both + turn * position + seconds * (velocity + turn * both));
+        self.velocity = growth * (velocity + turn * (2.0 * both + turn * position));
+    }
+
+    /// The position was observed with this variance. Returns the parts of the observed error by which to correct position and velocity.
+    pub fn correct(&mut self, variance: f64) -> [f64; 2] {
+        let Filter { position, both, .. } = *self;
+        let gains = [position, both].map(|covariance| covariance / (position + variance));
+        self.position -= gains[0] * position;
+        self.both -= gains[0] * both;
+        self.velocity -= gains[1] * both;
+        gains
+    }
+}
