@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from endless_gym import running_engines
+
 #: Size of a local Ray's object store in bytes; small, since jobs share only a few numbers.
 _STORE = 100_000_000
 #: Environment variable that tells Ray whether to kill the children of its worker processes when the workers exit.
@@ -69,6 +71,8 @@ def connected(address: str, spare_children: bool = False) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
+        # Ray kills trainers that take long to stop. Listing the engines removes the shared memory of dead processes.
+        running_engines()
 
 
 def gpus(wanted: float | None, device: str) -> float:

@@ -16,7 +16,7 @@ import pytest
 from agents_helpers import EXPERIMENT
 from rich.console import Console
 
-from endless_gym_agents import checkpoint, search
+from endless_gym_agents import checkpoint, ray_session, search
 from endless_gym_agents.search_study import Trials
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.train import train
@@ -28,6 +28,14 @@ SCRIPT = Path(__file__).parent / "ray_search.py"
 #: A small run with an engine process and a checkpoint after each update.
 SMALL = "--preset quick --env MortarMayhem-Grid-v0 --agent gru --environment.num-envs 4 --environment.engine process"
 SMALL += " --ppo.steps 16 --ppo.minibatches 1 --checkpoint-interval 1 --recurrence.hidden-size 16"
+#: A trainer that is killed after the end of its engine, while it holds an observation in shared memory.
+KILLED = """
+import os, signal, endless_gym
+envs = endless_gym.serve("MortarMayhem-Grid-v0", num_envs=1)
+observation, _ = envs.reset()
+envs.close()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
 SEARCH = [*SMALL.split(), "--parameters", "ppo.epochs", "--stage", "single"]
 
 
@@ -129,6 +137,15 @@ def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
     for run, done in zip(runs, before, strict=True):
         assert checkpoint.load(run).update == done + 1
         assert [json.loads(row)["update"] for row in _rows(run)] == list(range(1, done + 2))
+
+
+def test_the_end_of_ray_removes_shared_memory_of_killed_trainers(
+    tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]]
+) -> None:
+    with ray_session.connected("local"):
+        assert subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path).returncode == -signal.SIGKILL
+        assert segments()
+    assert not segments()
 
 
 def test_an_experiment_on_ray_is_stopped_and_resumed(

@@ -51,8 +51,9 @@ class EngineProcess:
                 self._process.stdin.write(json_text(config).encode())
                 self._process.stdin.flush()
         self._log = EngineLog(self._process)
+        self._clients: list[_native.Backend] = []
         # Also called when the interpreter exits. It must not refer to this object, which would then never be deleted.
-        self._end = weakref.finalize(self, _end, self._process, self._log, os.getpid())
+        self._end = weakref.finalize(self, _end, self._process, self._log, self._clients, os.getpid())
 
     @property
     def pid(self) -> int:
@@ -66,7 +67,9 @@ class EngineProcess:
             if (status := self._process.poll()) is not None:
                 raise RuntimeError(self._log.message() or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
-                return connect(self.service, timeout=timeout, engine=self, **kwargs)
+                envs = connect(self.service, timeout=timeout, engine=self, **kwargs)
+                self._clients.append(envs._backend)
+                return envs
             if time.monotonic() >= end:
                 raise TimeoutError(f"the engine did not start within {timeout} seconds")
             time.sleep(0.01)
@@ -76,12 +79,16 @@ class EngineProcess:
         self._end()
 
 
-def _end(process: subprocess.Popen[bytes], log: EngineLog, owner: int) -> None:
+def _end(process: subprocess.Popen[bytes], log: EngineLog, clients: list[_native.Backend], owner: int) -> None:
     """Stops an engine that the process `owner` started, and waits for its end."""
     if owner != os.getpid():
         # Keeps Popen from warning about a running child.
         process.returncode = 0
         return
+    # Another thread may still use them when the interpreter exits. If this process is killed from here on, the engine removes
+    # their shared memory.
+    for client in clients:
+        client.close()
     if process.stdin is not None:
         # Closing it is not enough: processes that were forked from this one keep it open.
         with contextlib.suppress(BrokenPipeError):

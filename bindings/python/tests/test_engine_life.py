@@ -12,7 +12,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from support import await_end_of_engines
+from support import await_end_of_engines, segments
 
 import endless_gym
 
@@ -87,6 +87,20 @@ def test_an_engine_ends_before_its_interpreter_does(end: str) -> None:
     ended = subprocess.run([sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=60)
     assert not Path(f"/proc/{int(ended.stdout)}").exists()
     assert endless_gym.running_engines() == []
+
+
+def test_a_trainer_killed_while_its_interpreter_exits_leaves_no_shared_memory() -> None:
+    """A thread keeps the environments alive; the handler that kills runs after the one that ends the engine."""
+    text = f"""
+import atexit, os, signal, threading
+atexit.register(os.kill, os.getpid(), signal.SIGKILL)
+import endless_gym
+envs = endless_gym.serve({ID!r}, 4)
+envs.reset()
+threading.Thread(target=lambda envs: threading.Event().wait(), args=[envs], daemon=True).start()
+"""
+    assert subprocess.run([sys.executable, "-c", text], timeout=60).returncode == -signal.SIGKILL
+    assert not segments()
 
 
 def test_engines_end_with_the_kernel_of_a_notebook() -> None:
