@@ -9,6 +9,7 @@ from pathlib import Path
 
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
 CRATES = [
+    "agents/kernels",
     "bindings/web",
     "engine/cli",
     "engine/core",

@@ -15,7 +15,7 @@ const TOOLS: [&str; 2] = ["maturin==1.16.0", "ziglang==0.17.1"];
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, dependencies first.
-const CRATES: [&str; 10] = [
+const CRATES: [&str; 11] = [
     "endless-gym-core",
     "endless-gym-memory-gym",
     "endless-gym-popgym",
@@ -24,6 +24,7 @@ const CRATES: [&str; 10] = [
     "endless-gym-view",
     "endless-gym-cli",
     "endless-gym",
+    "endless-gym-kernels",
     "endless-gym-python",
     "endless-gym-web",
 ];

@@ -22,7 +22,7 @@ use crate::pool::{Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions
 use crate::random::Generator;
 use crate::raster::PixelFormat;
 
-pub use counting::CountingAllocator;
+pub use counting::{CountingAllocator, allocations};
 
 /// Environments of a pool.
 const NUM_ENVS: usize = 4;

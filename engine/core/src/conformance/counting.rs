@@ -45,8 +45,8 @@ unsafe impl GlobalAlloc for CountingAllocator {
     }
 }
 
-/// Allocations of this thread so far.
-pub(super) fn allocations() -> usize {
+/// Allocations of this thread so far, in programs and tests that have the [`CountingAllocator`].
+pub fn allocations() -> usize {
     ALLOCATIONS.get()
 }
 

@@ -1,0 +1,165 @@
+//! Gated recurrent units (Cho et al., 2014), with the gates of `torch.nn.GRU`.
+//!
+//! With the projected inputs `x = W_i input + b_i` and the state `h'` before a step:
+//!
+//! ```text
+//! r = sigmoid(x_r + W_r h' + b_r)           reset gate
+//! z = sigmoid(x_z + W_z h' + b_z)           update gate
+//! p = W_n h' + b_n
+//! n = tanh(x_n + r p)                       candidate
+//! h = (1 - z) n + z h'
+//! ```
+//!
+//! Shapes: M steps of S [`Sequences`], H units; projected inputs (M, 3 H) and weight (3 H, H) and bias (3 H,) in the order r, z, n. The
+//! inputs of all steps are projected at once by [`linear`](crate::linear), and the gradient of the weight is one product over all
+//! steps (Appleyard et al., "Optimizing performance of recurrent neural networks on GPUs", 2016). Only the products with `h'` are
+//! computed step by step.
+
+use crate::functions::{sigmoid, tanh};
+use crate::matrix::{Matrix, Packed, add_product, add_rows, fill_rows};
+use crate::sequences::{Sequences, parts, parts_mut};
+use crate::vectors::vectorised;
+
+/// What [`forward`] saves for [`backward`] per step and unit: r, z, n, p and `h'`.
+pub const SAVED: usize = 5;
+
+/// Memory that calls reuse.
+#[derive(Default)]
+pub struct Workspace {
+    packed: Packed,
+    rows: Vec<f32>,
+}
+
+/// Computes the hidden states after all steps.
+///
+/// # Arguments
+///
+/// - `inputs`: projected inputs, (M, 3 H)
+/// - `weight`: recurrent weight, packed from the transposed matrix (H, 3 H)
+/// - `bias`: recurrent bias, (3 H,)
+/// - `state`: hidden states before the first steps, (S, H)
+/// - `saved`: overwritten, (M, 5 H)
+/// - `outputs`: overwritten with the hidden states, (M, H)
+///
+/// # Panics
+///
+/// The shapes do not fit.
+#[allow(clippy::too_many_arguments)]
+pub fn forward(
+    sequences: Sequences,
+    inputs: &[f32],
+    weight: &Packed,
+    bias: &[f32],
+    state: &[f32],
+    saved: &mut [f32],
+    outputs: &mut [f32],
+    workspace: &mut Workspace,
+) {
+    let width = bias.len() / 3;
+    workspace.rows.resize(sequences.count() * 3 * width, 0.0);
+    for step in sequences.forward() {
+        let saved = &mut saved[step.rows.start * SAVED * width..step.rows.end * SAVED * width];
+        for (row, saved) in step.rows.clone().zip(saved.chunks_exact_mut(SAVED * width)) {
+            step.copy_state_before(row, state, outputs, &mut saved[4 * width..]);
+        }
+        let recurrent = &mut workspace.rows[..step.rows.len() * 3 * width];
+        fill_rows(recurrent, bias);
+        add_product(recurrent, Matrix::new(saved, SAVED * width).columns(4 * width..5 * width), weight);
+        let (saved, recurrent) = (saved.chunks_exact_mut(SAVED * width), recurrent.chunks_exact(3 * width));
+        for ((row, saved), recurrent) in step.rows.clone().zip(saved).zip(recurrent) {
+            let input = &inputs[row * 3 * width..][..3 * width];
+            unit_forward(input, recurrent, saved, &mut outputs[row * width..][..width]);
+        }
+    }
+}
+
+vectorised! {
+/// One step of one sequence.
+fn unit_forward(input: &[f32], recurrent: &[f32], saved: &mut [f32], output: &mut [f32]) {
+    let width = output.len();
+    let ([x_r, x_z, x_n], [w_r, w_z, w_n]) = (parts(input, width), parts(recurrent, width));
+    let [r, z, n, p, before] = parts_mut(saved, width);
+    for i in 0..width {
+        r[i] = sigmoid(x_r[i] + w_r[i]);
+        z[i] = sigmoid(x_z[i] + w_z[i]);
+        p[i] = w_n[i];
+        n[i] = tanh(r[i].mul_add(p[i], x_n[i]));
+        output[i] = z[i].mul_add(before[i] - n[i], n[i]);
+    }
+}
+}
+
+/// Computes the gradients of the inputs and of the states before the first steps, and adds those of weight and bias to
+/// `grad_weight` and `grad_bias`.
+///
+/// With the gradient `g` of `h`, from this step's output and the step after:
+///
+/// ```text
+/// dx_n = g (1 - z) (1 - n^2)       dx_r = dx_n p r (1 - r)       dx_z = g (h' - n) z (1 - z)
+/// d = (dx_r, dx_z, dx_n r)         dh' = g z + W^T d             dW += d h'^T        db += d
+/// ```
+///
+/// # Arguments
+///
+/// - `weight`: recurrent weight, (3 H, H)
+/// - `saved`: what [`forward`] saved, (M, 5 H)
+/// - `grad_outputs`: gradients of the outputs, (M, H)
+/// - `grad_inputs`: overwritten with the gradients of the projected inputs, (M, 3 H)
+/// - `grad_state`: overwritten with the gradients of the states before the first steps, (S, H)
+///
+/// # Panics
+///
+/// The shapes do not fit.
+#[allow(clippy::too_many_arguments)]
+pub fn backward(
+    sequences: Sequences,
+    weight: &[f32],
+    saved: &[f32],
+    grad_outputs: &[f32],
+    grad_inputs: &mut [f32],
+    grad_weight: &mut [f32],
+    grad_bias: &mut [f32],
+    grad_state: &mut [f32],
+    workspace: &mut Workspace,
+) {
+    let width = grad_bias.len() / 3;
+    let Workspace { packed, rows: deltas } = workspace;
+    packed.pack(Matrix::new(weight, width));
+    deltas.resize(sequences.steps() * 3 * width, 0.0);
+    grad_state.fill(0.0);
+    for step in sequences.backward() {
+        for (row, carry) in step.rows.clone().zip(grad_state.chunks_exact_mut(width)) {
+            unit_backward(
+                &saved[row * SAVED * width..][..SAVED * width],
+                &grad_outputs[row * width..][..width],
+                carry,
+                &mut grad_inputs[row * 3 * width..][..3 * width],
+                &mut deltas[row * 3 * width..][..3 * width],
+            );
+        }
+        let deltas = Matrix::new(&deltas[step.rows.start * 3 * width..step.rows.end * 3 * width], 3 * width);
+        add_product(&mut grad_state[..step.rows.len() * width], deltas, packed);
+        step.stop_at_resets(grad_state, width);
+    }
+    packed.pack(Matrix::new(saved, SAVED * width).columns(4 * width..5 * width));
+    add_product(grad_weight, Matrix::new(deltas, 3 * width).t(), packed);
+    add_rows(grad_bias, deltas);
+}
+
+vectorised! {
+/// One step of one sequence. `carry` is the gradient of `h` from the step after, and then `g z`.
+fn unit_backward(saved: &[f32], grad_output: &[f32], carry: &mut [f32], grad_input: &mut [f32], delta: &mut [f32]) {
+    let width = grad_output.len();
+    let carry = &mut carry[..width];
+    let [r, z, n, p, before] = parts(saved, width);
+    let ([x_r, x_z, x_n], [w_r, w_z, w_n]) = (parts_mut(grad_input, width), parts_mut(delta, width));
+    for i in 0..width {
+        let g = grad_output[i] + carry[i];
+        carry[i] = g * z[i];
+        x_n[i] = g * (1.0 - z[i]) * (1.0 - n[i] * n[i]);
+        x_r[i] = x_n[i] * p[i] * r[i] * (1.0 - r[i]);
+        x_z[i] = g * (before[i] - n[i]) * z[i] * (1.0 - z[i]);
+        (w_r[i], w_z[i], w_n[i]) = (x_r[i], x_z[i], x_n[i] * r[i]);
+    }
+}
+}

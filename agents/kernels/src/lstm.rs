@@ -1,0 +1,178 @@
+//! Long short-term memory (Hochreiter and Schmidhuber, 1997; Gers et al., 2000), with the gates of `torch.nn.LSTM`.
+//!
+//! With the projected inputs `x = W_i input + b_i + b_h`, and the hidden state `h'` and the cell state `c'` before a step:
+//!
+//! ```text
+//! i = sigmoid(x_i + W_i h')       input gate
+//! f = sigmoid(x_f + W_f h')       forget gate
+//! g = tanh(x_g + W_g h')          candidate
+//! o = sigmoid(x_o + W_o h')       output gate
+//! c = f c' + i g
+//! h = o tanh(c)
+//! ```
+//!
+//! Shapes: M steps of S [`Sequences`], H units; projected inputs (M, 4 H) and weight (4 H, H) in the order i, f, g, o. As in
+//! [`gru`](crate::gru), only the products with `h'` are computed step by step.
+
+use crate::functions::{sigmoid, tanh};
+use crate::matrix::{Matrix, Packed, add_product};
+use crate::sequences::{Sequences, parts, parts_mut};
+use crate::vectors::vectorised;
+
+/// What [`forward`] saves for [`backward`] per step and unit: i, f, g, o, tanh(c), `c'` and `h'`.
+pub const SAVED: usize = 7;
+
+/// Memory that calls reuse.
+#[derive(Default)]
+pub struct Workspace {
+    packed: Packed,
+    rows: Vec<f32>,
+}
+
+/// Computes the hidden states and the cell states after all steps.
+///
+/// # Arguments
+///
+/// - `inputs`: projected inputs, (M, 4 H)
+/// - `weight`: recurrent weight, packed from the transposed matrix (H, 4 H)
+/// - `hidden`, `cell`: states before the first steps, (S, H)
+/// - `saved`: overwritten, (M, 7 H)
+/// - `outputs`: overwritten with the hidden states, (M, H)
+/// - `cells`: overwritten with the cell states, (M, H)
+///
+/// # Panics
+///
+/// The shapes do not fit.
+#[allow(clippy::too_many_arguments)]
+pub fn forward(
+    sequences: Sequences,
+    inputs: &[f32],
+    weight: &Packed,
+    hidden: &[f32],
+    cell: &[f32],
+    saved: &mut [f32],
+    outputs: &mut [f32],
+    cells: &mut [f32],
+    workspace: &mut Workspace,
+) {
+    let width = weight.rows();
+    workspace.rows.resize(sequences.count() * 4 * width, 0.0);
+    for step in sequences.forward() {
+        let saved = &mut saved[step.rows.start * SAVED * width..step.rows.end * SAVED * width];
+        for (row, saved) in step.rows.clone().zip(saved.chunks_exact_mut(SAVED * width)) {
+            step.copy_state_before(row, cell, cells, &mut saved[5 * width..6 * width]);
+            step.copy_state_before(row, hidden, outputs, &mut saved[6 * width..]);
+        }
+        let gates = &mut workspace.rows[..step.rows.len() * 4 * width];
+        gates.copy_from_slice(&inputs[step.rows.start * 4 * width..step.rows.end * 4 * width]);
+        add_product(gates, Matrix::new(saved, SAVED * width).columns(6 * width..7 * width), weight);
+        let (saved, gates) = (saved.chunks_exact_mut(SAVED * width), gates.chunks_exact(4 * width));
+        for ((row, saved), gates) in step.rows.clone().zip(saved).zip(gates) {
+            let (output, cell) = (&mut outputs[row * width..][..width], &mut cells[row * width..][..width]);
+            unit_forward(gates, saved, output, cell);
+        }
+    }
+}
+
+vectorised! {
+/// One step of one sequence.
+fn unit_forward(gates: &[f32], saved: &mut [f32], output: &mut [f32], cell: &mut [f32]) {
+    let width = output.len();
+    let cell = &mut cell[..width];
+    let [x_i, x_f, x_g, x_o] = parts(gates, width);
+    let [i, f, g, o, squashed, before, _] = parts_mut(saved, width);
+    for j in 0..width {
+        i[j] = sigmoid(x_i[j]);
+        f[j] = sigmoid(x_f[j]);
+        g[j] = tanh(x_g[j]);
+        o[j] = sigmoid(x_o[j]);
+        cell[j] = f[j].mul_add(before[j], i[j] * g[j]);
+        squashed[j] = tanh(cell[j]);
+        output[j] = o[j] * squashed[j];
+    }
+}
+}
+
+/// Computes the gradients of the inputs and of the states before the first steps, and adds that of the weight to `grad_weight`.
+///
+/// With the gradient `a` of `h`, from this step's output and the step after, and `b` of `c`, from the step after:
+///
+/// ```text
+/// dc = b + a o (1 - tanh(c)^2)        dx_o = a tanh(c) o (1 - o)
+/// dx_i = dc g i (1 - i)       dx_f = dc c' f (1 - f)       dx_g = dc i (1 - g^2)
+/// dc' = dc f       dh' = W^T dx       dW += dx h'^T
+/// ```
+///
+/// # Arguments
+///
+/// - `weight`: recurrent weight, (4 H, H)
+/// - `saved`: what [`forward`] saved, (M, 7 H)
+/// - `grad_outputs`: gradients of the outputs, (M, H)
+/// - `grad_inputs`: overwritten with the gradients of the projected inputs, (M, 4 H)
+/// - `grad_hidden`, `grad_cell`: overwritten with the gradients of the states before the first steps, (S, H)
+///
+/// # Panics
+///
+/// The shapes do not fit.
+#[allow(clippy::too_many_arguments)]
+pub fn backward(
+    sequences: Sequences,
+    weight: &[f32],
+    saved: &[f32],
+    grad_outputs: &[f32],
+    grad_inputs: &mut [f32],
+    grad_weight: &mut [f32],
+    grad_hidden: &mut [f32],
+    grad_cell: &mut [f32],
+    workspace: &mut Workspace,
+) {
+    let Some(width) = grad_hidden.len().checked_div(sequences.count()) else { return };
+    let packed = &mut workspace.packed;
+    packed.pack(Matrix::new(weight, width));
+    grad_hidden.fill(0.0);
+    grad_cell.fill(0.0);
+    for step in sequences.backward() {
+        let carries = grad_hidden.chunks_exact_mut(width).zip(grad_cell.chunks_exact_mut(width));
+        for (row, (carry, carry_cell)) in step.rows.clone().zip(carries) {
+            unit_backward(
+                &saved[row * SAVED * width..][..SAVED * width],
+                &grad_outputs[row * width..][..width],
+                carry,
+                carry_cell,
+                &mut grad_inputs[row * 4 * width..][..4 * width],
+            );
+        }
+        let deltas = Matrix::new(&grad_inputs[step.rows.start * 4 * width..step.rows.end * 4 * width], 4 * width);
+        add_product(&mut grad_hidden[..step.rows.len() * width], deltas, packed);
+        step.stop_at_resets(grad_hidden, width);
+        step.stop_at_resets(grad_cell, width);
+    }
+    packed.pack(Matrix::new(saved, SAVED * width).columns(6 * width..7 * width));
+    add_product(grad_weight, Matrix::new(grad_inputs, 4 * width).t(), packed);
+}
+
+vectorised! {
+/// One step of one sequence. `carry` and `carry_cell` are the gradients of `h` and `c` from the step after, and then 0 and `dc f`.
+fn unit_backward(
+    saved: &[f32],
+    grad_output: &[f32],
+    carry: &mut [f32],
+    carry_cell: &mut [f32],
+    grad_input: &mut [f32],
+) {
+    let width = grad_output.len();
+    let (carry, carry_cell) = (&mut carry[..width], &mut carry_cell[..width]);
+    let [i, f, g, o, squashed, before, _] = parts(saved, width);
+    let [x_i, x_f, x_g, x_o] = parts_mut(grad_input, width);
+    for j in 0..width {
+        let a = grad_output[j] + carry[j];
+        let dc = carry_cell[j] + a * o[j] * (1.0 - squashed[j] * squashed[j]);
+        carry[j] = 0.0;
+        carry_cell[j] = dc * f[j];
+        x_i[j] = dc * g[j] * i[j] * (1.0 - i[j]);
+        x_f[j] = dc * before[j] * f[j] * (1.0 - f[j]);
+        x_g[j] = dc * i[j] * (1.0 - g[j] * g[j]);
+        x_o[j] = a * squashed[j] * o[j] * (1.0 - o[j]);
+    }
+}
+}
