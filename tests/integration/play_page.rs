@@ -11,7 +11,7 @@ fn the_page_opens_at_an_episode() {
     let browser = place.script("browser", BROWSER);
     let mut command = place.endless(&arguments);
     command.env("BROWSER", &browser);
-    if !endless_gym_page::is_built() {
+    if endless_gym_page::engine().is_none() {
         // Only release builds contain the page; `cargo xtask test --only packages` tests them.
         let output = command.output().unwrap();
         assert!(!output.status.success());
@@ -35,6 +35,11 @@ fn invalid_arguments_are_reported_before_the_page_is_served() {
         (&["play", "Pong-v0"][..], "no environment `Pong-v0`"),
         (&["play", "MysteryPath-v0", "--option", "speed"], "--option speed: expected NAME=VALUE"),
         (&["play", "MysteryPath-v0", "--option", "speed=1"], "no reset parameter `speed`"),
+        // POPGym is not on the page.
+        (
+            &["play", "popgym-RepeatFirstEasy-v0"],
+            "terminal with `--terminal`, or write the page of your own crate with `endless page --out",
+        ),
     ] {
         let output = place.run(arguments);
         assert_eq!(output.status.code(), Some(1));

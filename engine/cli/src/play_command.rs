@@ -11,9 +11,11 @@ use super::{open, stop, terminal};
 
 /// Arguments of `endless play`.
 ///
-/// In the terminal, arrows or W A S D move, Q E Z C move diagonally. Space or P pauses; while paused, N plays one step
-/// without moving, and a movement key plays one step with it. R restarts the episode, page up and page down start the
-/// episode of the next and the previous seed, Esc or Ctrl-C quits.
+/// In the terminal, arrows or W A S D move, Q E Z C move diagonally, where choices are named left, right, up, ahead or
+/// down. Digits choose other choices by their number, which arrows also change, as they do the numbers of a box; Tab
+/// selects the next number, and Enter plays where the game waits for an action. The episode starts with the first key.
+/// Space or P pauses; while paused, N plays one step without moving, and a movement key plays one step with it. R
+/// restarts the episode, page up and page down start the episode of the next and the previous seed, Esc or Ctrl-C quits.
 ///
 /// Most terminals do not report when a key is released, but report a key that is down repeatedly, after a delay that
 /// the system sets. A key acts in at least one step, until HOLD seconds after its last report. Another direction
@@ -45,7 +47,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     let spec = registry.spec(&args.id)?;
     PoolConfig { options: ResetOptions::Shared(options.clone()), ..PoolConfig::new(spec.id, 1) }.validate(spec)?;
     let stop = stop::on_signal()?;
-    let server = PlayServer::bind(args.page.port)?;
+    let server = PlayServer::bind(args.page.port, spec.id)?;
     let url = server.url(spec.id, &options, args.seed);
     print(format_args!("play {} at {url}\nstop with Ctrl-C", spec.id))?;
     if args.page.open {

@@ -13,9 +13,19 @@ pub enum ViewError {
     },
     /// This program does not include the page that plays the environments.
     #[error(
-        "this program was built without the page that plays the environments: run `cargo xtask web`, then build with --release"
+        "this program was built without the page that plays the environments: run `cargo xtask web`, then build with --release; \
+         or play in the terminal with `--terminal`, or write the page of your own crate with `endless page --out FOLDER`"
     )]
     PageNotBuilt,
+    /// The page of this program does not have the environment.
+    #[error(
+        "`{id}` is not on the page of this program: play it in the terminal with `--terminal`, or write the page of your own crate \
+         with `endless page --out FOLDER`"
+    )]
+    NotOnPage {
+        /// The environment's id.
+        id: String,
+    },
     /// The server cannot run.
     #[error("the web server cannot run: {reason}")]
     Server {

@@ -23,7 +23,7 @@ const WORKER: &str = "addEventListener('install', () => skipWaiting());\n\
 ///
 /// use endless_gym_view::PlayServer;
 ///
-/// let server = PlayServer::bind(0)?;
+/// let server = PlayServer::bind(0, "MysteryPath-v0")?;
 /// println!("{}", server.url("MysteryPath-v0", &serde_json::Map::new(), Some(7)));
 /// server.run(&AtomicBool::new(false))?;
 /// # Ok::<(), endless_gym_view::ViewError>(())
@@ -34,15 +34,14 @@ pub struct PlayServer {
 }
 
 impl PlayServer {
-    /// Binds the port; 0 for any free one.
+    /// Binds the port, 0 for any free one, to play an environment.
     ///
     /// # Errors
     ///
-    /// [`ViewError::PageNotBuilt`] if this program was built without the page, and [`ViewError::Port`] if the port is taken.
-    pub fn bind(port: u16) -> Result<Self, ViewError> {
-        if !endless_gym_page::is_built() {
-            return Err(ViewError::PageNotBuilt);
-        }
+    /// [`ViewError::PageNotBuilt`] if this program was built without the page, [`ViewError::NotOnPage`] if its page does not have the
+    /// environment, and [`ViewError::Port`] if the port is taken.
+    pub fn bind(port: u16, id: &str) -> Result<Self, ViewError> {
+        check(endless_gym_page::engine(), id)?;
         Ok(PlayServer { port: LocalPort::bind(port)? })
     }
 
@@ -59,6 +58,12 @@ impl PlayServer {
     pub fn run(self, stop: &AtomicBool) -> Result<(), ViewError> {
         self.port.serve(Router::new().fallback(answer), stop)
     }
+}
+
+/// Checks that the page's engine has an environment.
+fn check(engine: Option<&[u8]>, id: &str) -> Result<(), ViewError> {
+    let is_on_page = endless_gym_page::names(engine.ok_or(ViewError::PageNotBuilt)?, id);
+    is_on_page.then_some(()).ok_or_else(|| ViewError::NotOnPage { id: id.to_owned() })
 }
 
 async fn answer(method: Method, address: Uri) -> Response {
@@ -117,6 +122,17 @@ mod tests {
             assert_eq!(answered(Method::GET, path).status(), StatusCode::NOT_FOUND, "{path}");
         }
         assert_eq!(answered(Method::POST, "/").status(), StatusCode::METHOD_NOT_ALLOWED);
+    }
+
+    #[test]
+    fn an_environment_that_is_not_on_the_page_is_an_error_that_names_what_works() {
+        let engine = Some(b"\0asm MysteryPath-v0 ".as_slice());
+        assert!(check(engine, "MysteryPath-v0").is_ok());
+        for error in [check(engine, "popgym-RepeatFirstEasy-v0"), check(None, "MysteryPath-v0")] {
+            let message = error.unwrap_err().to_string();
+            assert!(message.contains("`--terminal`") && message.contains("`endless page --out FOLDER`"), "{message}");
+            assert!(!message.contains('\n'));
+        }
     }
 
     #[test]

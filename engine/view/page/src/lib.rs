@@ -24,9 +24,19 @@ pub fn file(name: &str) -> Option<&'static [u8]> {
     FILES.iter().find_map(|(other, bytes)| (*other == name).then_some(*bytes))
 }
 
-/// Whether the engine was built before this crate, so that the page can be played.
-pub fn is_built() -> bool {
-    file(ENGINE).is_some()
+/// The engine of the page, if it was built before this crate. Without it, the page cannot be played.
+pub fn engine() -> Option<&'static [u8]> {
+    file(ENGINE)
+}
+
+/// Whether an engine contains the text of an id. One that does not cannot have the environment.
+///
+/// ```
+/// assert!(endless_gym_page::names(b"\0asm..TMaze-v0..", "TMaze-v0"));
+/// assert!(!endless_gym_page::names(b"\0asm..TMaze-v0..", "Maze-v1"));
+/// ```
+pub fn names(engine: &[u8], id: &str) -> bool {
+    engine.windows(id.len().max(1)).any(|part| part == id.as_bytes())
 }
 
 /// Names and contents of all files of a page with another engine, for any web server. `has_id` says whether the engine has an
