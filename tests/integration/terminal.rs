@@ -14,7 +14,7 @@ use rustix::process::Signal;
 use rustix::termios::{LocalModes, tcgetattr};
 
 const COLUMNS: u16 = 84;
-const ROWS: u16 = 46;
+const ROWS: u16 = 48;
 
 /// A program in a terminal.
 struct Session {
@@ -25,11 +25,15 @@ struct Session {
 
 impl Session {
     fn start(command: &mut Command) -> Self {
-        let (terminal, program_side) = pseudo_terminal(COLUMNS, ROWS);
+        Self::sized(command, COLUMNS, ROWS)
+    }
+
+    fn sized(command: &mut Command, columns: u16, rows: u16) -> Self {
+        let (terminal, program_side) = pseudo_terminal(columns, rows);
         let side = || program_side.try_clone().unwrap();
         let process = Process::spawn(command.stdin(side()).stdout(side()).stderr(side()));
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-        let screen = Arc::new(Mutex::new(vt100::Parser::new(ROWS, COLUMNS, 0)));
+        let screen = Arc::new(Mutex::new(vt100::Parser::new(rows, columns, 0)));
         let (mut output, written) = (terminal.try_clone().unwrap(), Arc::clone(&screen));
         std::thread::spawn(move || {
             let mut bytes = [0; 4096];
@@ -48,10 +52,15 @@ impl Session {
         self.screen.lock().unwrap().screen().contents()
     }
 
-    /// Waits until the screen shows that text.
+    /// The text on the screen, in one line.
+    fn line(&self) -> String {
+        in_one_line(&self.contents())
+    }
+
+    /// Waits until the screen shows that text, which may be broken into lines.
     #[track_caller]
     fn wait_for(&self, text: &str) {
-        wait_until(text, || self.contents().contains(text));
+        wait_until(text, || self.line().contains(&in_one_line(text)));
     }
 
     /// The frame-sized picture in the upper left corner, in rows.
@@ -85,6 +94,17 @@ impl Session {
     }
 }
 
+fn in_one_line(text: &str) -> String {
+    let mut line = String::new();
+    for character in text.chars() {
+        let character = if character.is_whitespace() { ' ' } else { character };
+        if character != ' ' || !line.ends_with(' ') {
+            line.push(character);
+        }
+    }
+    line
+}
+
 /// The observation of an episode after these actions, in rows.
 fn frame(id: &str, seed: u64, actions: &[&[i32]]) -> Vec<[u8; 3]> {
     let mut player = Player::new(&PoolConfig::new(id, 1));
@@ -99,8 +119,10 @@ fn a_game_is_played_with_keys() {
     let place = Place::new();
     let id = "MysteryPath-Grid-v0";
     let mut session = Session::start(&mut place.endless(&["play", id, "--terminal", "--seed", "3", "--fps", "1"]));
-    session.wait_for("seed 3");
+    session.wait_for("seed 3  step 0  reward 0.000  return 0.000 waits for the first key");
     assert!(!session.is_left());
+    session.press(" ");
+    session.wait_for("step 1 ");
     session.press(" ");
     session.wait_for("paused");
     session.press("r");
@@ -124,6 +146,82 @@ fn a_game_is_played_with_keys() {
     session.wait_for("step 1 ");
     session.press("\x1b");
     assert_eq!(session.end(), Some(0));
+}
+
+#[test]
+fn every_kind_of_action_is_played_with_keys_in_a_narrow_terminal() {
+    let place = Place::new();
+    let play = |id: &str| {
+        let session = Session::sized(&mut place.endless(&["play", id, "--terminal", "--fps", "10"]), 70, 24);
+        session.wait_for("Esc quits");
+        session
+    };
+    let mut named = play("popgym-RepeatFirstEasy-v0");
+    assert!(named.line().contains("digits choose 0 spades 1 diamonds 2 clubs 3 hearts, Enter plays, R restarts"));
+    assert!(named.contents().contains("suit "), "features are shown where there are no frames");
+    named.press("2");
+    named.wait_for("step 1 ");
+    named.press("\r");
+    named.wait_for("step 2 ");
+    let mut board = play("popgym-BattleshipMedium-v0");
+    board.press("3\t9");
+    board.wait_for("action 0 3  [action 1 9]");
+    assert!(board.line().contains("step 0 "), "{}", board.line());
+    board.press("\r");
+    board.wait_for("step 1 ");
+    let mut many = play("popgym-ConcentrationEasy-v0");
+    many.press("41");
+    many.wait_for("[action 41]");
+    many.press("\r");
+    many.wait_for("step 1 ");
+    assert!(!many.line().contains("card_41 2"), "the card has been turned over");
+    let mut torque = play("popgym-PositionOnlyPendulumEasy-v0");
+    torque.wait_for("waits for the first key");
+    torque.press("\x1b[C\x1b[C");
+    torque.wait_for("[action 0.40 in -2 to 2]");
+    torque.wait_for("step 3 ");
+    let mut pole = play("popgym-PositionOnlyCartPoleEasy-v0");
+    pole.press("d");
+    pole.wait_for("step 1 ");
+    let both = play("MortarMayhem-v0");
+    assert!(
+        both.line()
+            .contains("arrows or W A S D move, Q E Z C diagonally, Space pauses, N one step, R restarts, PgUp/PgDn")
+    );
+    for mut session in [named, board, many, torque, pole, both] {
+        session.press("\x1b");
+        assert_eq!(session.end(), Some(0));
+    }
+}
+
+/// Starts a program in a terminal, closes the terminal's window once it shows a text, and checks that the program ends.
+#[track_caller]
+fn ends_without_its_terminal(command: &mut Command, text: &str, keys: &str) {
+    let (mut terminal, program_side) = pseudo_terminal(COLUMNS, ROWS);
+    let side = || program_side.try_clone().unwrap();
+    let mut process = Process::spawn(command.stdin(side()).stdout(side()).stderr(side()));
+    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    drop(program_side);
+    terminal.write_all(keys.as_bytes()).unwrap();
+    let (mut screen, mut bytes) = (vt100::Parser::new(ROWS, COLUMNS, 0), [0; 4096]);
+    while !in_one_line(&screen.screen().contents()).contains(text) {
+        let count = terminal.read(&mut bytes).unwrap();
+        screen.process(&bytes[..count]);
+    }
+    drop(terminal);
+    assert_eq!(process.wait().code(), Some(0), "{text}");
+}
+
+#[test]
+fn a_game_and_a_view_end_when_their_terminal_goes_away() {
+    let place = Place::new();
+    let play = ["play", "MysteryPath-v0", "--terminal"];
+    ends_without_its_terminal(&mut place.endless(&play), "waits for the first key", "");
+    ends_without_its_terminal(&mut place.endless(&play), "step 3 ", "w");
+    ends_without_its_terminal(&mut place.endless(&play), "paused", "n");
+    let _engine = place.serve(&["--env", "MysteryPath-v0", "--num-envs", "1"]);
+    let view = ["view", "--terminal", "--timeout", "20"];
+    ends_without_its_terminal(&mut place.endless(&view), "no trainer has stepped", "");
 }
 
 #[test]

@@ -110,7 +110,8 @@ fn read(pipe: Option<impl Read>) -> String {
 
 /// Both ends of a pseudo-terminal: the terminal emulator's, and that of the program in it.
 pub fn pseudo_terminal(columns: u16, rows: u16) -> (File, File) {
-    let emulator = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+    // A program that inherited the emulator's end would keep it open.
+    let emulator = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
     grantpt(&emulator).unwrap();
     unlockpt(&emulator).unwrap();
     tcsetwinsize(&emulator, Winsize { ws_row: rows, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();

@@ -1,7 +1,7 @@
 //! One environment that a person plays.
 
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
-use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::envs::{Column, EnvSpec};
 use endless_gym_core::pool::{
     Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads,
 };
@@ -67,6 +67,16 @@ impl Game {
         newest(self.batch().observation(), Frames::default(), self.spec().frame.unwrap_or(FrameShape::rgb(1, 1)))
     }
 
+    /// What the agent sees of an environment without frames.
+    pub fn features(&self) -> String {
+        let feature = |(column, value): (&Column, &f32)| match value.fract() {
+            0.0 => format!("{} {value}", column.name),
+            _ => format!("{} {value:.3}", column.name),
+        };
+        let features = self.spec().features.iter().zip(self.batch().features()).map(feature);
+        features.collect::<Vec<_>>().join("  ")
+    }
+
     /// Seed, steps and rewards.
     pub fn numbers(&self) -> String {
         let batch = self.batch();
@@ -87,8 +97,11 @@ impl Game {
         Ok(parts.join("  "))
     }
 
-    /// The commands in the vector observation, decoded from its one-hot codes; empty if there are none.
+    /// The commands in the vector observation of Memory Gym's `MortarMayhemB`, decoded from its one-hot codes; empty for other ids.
     pub fn commands(&self) -> String {
+        if !self.spec().id.starts_with("MortarMayhemB") {
+            return String::new();
+        }
         const ARROWS: [&str; 9] = ["⊗", "→", "←", "↑", "↓", "↘", "↗", "↙", "↖"];
         let places = self.batch().vector_observation().chunks_exact(ARROWS.len());
         let arrows =

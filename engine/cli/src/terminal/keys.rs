@@ -1,4 +1,4 @@
-//! Turns keys into actions.
+//! Turns keys into commands, and says which directions are held.
 //!
 //! Most terminals report that a key was pressed, repeatedly while it is down, but not that it was released. A key acts
 //! in at least one step, until a short time after its last report. In terminals with the kitty keyboard protocol, which
@@ -6,7 +6,6 @@
 
 use std::time::{Duration, Instant};
 
-use endless_gym_core::envs::EnvSpec;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
 /// A direction of movement.
@@ -27,6 +26,12 @@ pub enum Command {
     Move(&'static [Direction]),
     /// The end of a movement.
     Stop(&'static [Direction]),
+    /// A digit.
+    Digit(i32),
+    /// Selects the next number.
+    Select,
+    /// A step with the chosen action.
+    Play,
     Pause,
     OneStep,
     Restart,
@@ -34,10 +39,6 @@ pub enum Command {
     PreviousSeed,
     Quit,
 }
-
-/// The help for the keys.
-pub const HELP: &str =
-    "arrows or W A S D move, Q E Z C diagonally, Space pauses, N one step, R restarts, PgUp/PgDn seed, Esc quits";
 
 /// The command of a key's event.
 pub fn command(event: KeyEvent) -> Option<Command> {
@@ -67,6 +68,9 @@ pub fn command(event: KeyEvent) -> Option<Command> {
         (_, moved) => return Some(Command::Move(moved)),
     }
     match event.code {
+        KeyCode::Char(digit @ '0'..='9') => Some(Command::Digit(digit as i32 - '0' as i32)),
+        KeyCode::Tab => Some(Command::Select),
+        KeyCode::Enter => Some(Command::Play),
         KeyCode::Char(' ' | 'p' | 'P') => Some(Command::Pause),
         KeyCode::Char('n' | 'N') => Some(Command::OneStep),
         KeyCode::Char('r' | 'R') => Some(Command::Restart),
@@ -134,38 +138,20 @@ impl Keys {
         self.held.clear();
     }
 
-    /// The action of a step at that time.
-    pub fn action(&mut self, spec: &EnvSpec, now: Instant) -> Vec<i32> {
+    /// The directions that act in a step at that time, in the order in which they were pressed.
+    pub fn act(&mut self, now: Instant) -> Vec<Direction> {
         let Keys { hold, has_releases, .. } = *self;
         self.held.retain(|held| {
             let is_held = if has_releases { !held.is_released } else { now.duration_since(held.pressed) < hold };
             !held.has_acted || is_held
         });
         self.held.iter_mut().for_each(|held| held.has_acted = true);
-        let directions: Vec<Direction> = self.held.iter().map(|held| held.direction).collect();
-        action(spec, &directions)
+        self.held.iter().map(|held| held.direction).collect()
     }
-}
-
-/// The action that moves in these directions. If only one is possible, the last one counts.
-fn action(spec: &EnvSpec, directions: &[Direction]) -> Vec<i32> {
-    let choice = |branch: &endless_gym_core::envs::ActionBranch, direction: &Direction| {
-        let names: &[&str] = match direction {
-            Left => &["left"],
-            Right => &["right"],
-            Up => &["up", "ahead"],
-            Down => &["down"],
-        };
-        branch.choices.iter().position(|choice| names.contains(&choice.name))
-    };
-    let number = |branch| directions.iter().rev().find_map(|direction| choice(branch, direction)).unwrap_or(0);
-    spec.actions.iter().map(|branch| number(branch) as i32).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_memory_gym::memory_gym;
-
     use super::*;
 
     const HOLD: Duration = Duration::from_millis(150);
@@ -175,66 +161,54 @@ mod tests {
     }
 
     #[test]
-    fn directions_are_the_environments_actions() {
-        let act = |id: &str, directions: &[Direction]| action(memory_gym().spec(id).unwrap(), directions);
-        assert_eq!(act("MortarMayhem-v0", &[]), [0, 0]);
-        assert_eq!(act("MortarMayhem-v0", &[Left, Down]), [1, 2]);
-        assert_eq!(act("SearingSpotlights-v0", &[Right, Up]), [2, 1]);
-        assert_eq!(act("MysteryPath-Grid-v0", &[Up]), [3]);
-        assert_eq!(act("MysteryPath-Grid-v0", &[Down]), [0]);
-        assert_eq!(act("Endless-MysteryPath-v0", &[Right, Up]), [2]);
-        assert_eq!(act("Endless-MysteryPath-v0", &[Left]), [0]);
-    }
-
-    #[test]
     fn a_key_acts_at_least_once_and_while_it_is_reported() {
-        let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let start = Instant::now();
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);
-        assert_eq!(keys.action(spec, after(start, 400)), [1, 0], "a step that comes late");
-        assert_eq!(keys.action(spec, after(start, 440)), [0, 0]);
+        assert_eq!(keys.act(after(start, 400)), [Left], "a step that comes late");
+        assert_eq!(keys.act(after(start, 440)), []);
         keys.press(&[Left], after(start, 500));
         keys.press(&[Left], after(start, 530));
-        assert_eq!(keys.action(spec, after(start, 540)), [1, 0]);
-        assert_eq!(keys.action(spec, after(start, 670)), [1, 0]);
-        assert_eq!(keys.action(spec, after(start, 690)), [0, 0]);
+        assert_eq!(keys.act(after(start, 540)), [Left]);
+        assert_eq!(keys.act(after(start, 670)), [Left]);
+        assert_eq!(keys.act(after(start, 690)), []);
         let mut grid = Keys::new(Duration::ZERO);
         grid.press(&[Left], start);
-        assert_eq!(grid.action(spec, start), [1, 0]);
-        assert_eq!(grid.action(spec, start), [0, 0]);
+        assert_eq!(grid.act(start), [Left]);
+        assert_eq!(grid.act(start), []);
     }
 
     #[test]
     fn a_new_direction_replaces_the_old_one_unless_pressed_in_the_same_step() {
-        let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let start = Instant::now();
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);
         keys.press(&[Up], start);
-        assert_eq!(keys.action(spec, start), [1, 1]);
+        assert_eq!(keys.act(start), [Left, Up]);
         keys.press(&[Down], after(start, 20));
-        assert_eq!(keys.action(spec, after(start, 30)), [0, 2]);
+        assert_eq!(keys.act(after(start, 30)), [Down]);
         keys.press(&[Right], after(start, 40));
-        assert_eq!(keys.action(spec, after(start, 50)), [2, 0]);
+        assert_eq!(keys.act(after(start, 50)), [Right]);
         keys.press(&[Left, Up], after(start, 60));
-        assert_eq!(keys.action(spec, after(start, 70)), [1, 1]);
+        assert_eq!(keys.act(after(start, 70)), [Left, Up]);
         keys.clear();
-        assert_eq!(keys.action(spec, after(start, 80)), [0, 0]);
+        assert_eq!(keys.act(after(start, 80)), []);
     }
 
     #[test]
     fn reported_releases_end_a_movement() {
-        let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let start = Instant::now();
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);
         keys.release(&[Left]);
-        assert_eq!(keys.action(spec, start), [1, 0], "a short press acts once");
-        assert_eq!(keys.action(spec, start), [0, 0]);
+        assert_eq!(keys.act(start), [Left], "a short press acts once");
+        assert_eq!(keys.act(start), []);
         keys.press(&[Right], start);
-        assert_eq!(keys.action(spec, after(start, 5000)), [2, 0]);
+        assert_eq!(keys.act(after(start, 5000)), [Right]);
         keys.press(&[Up], after(start, 5001));
-        assert_eq!(keys.action(spec, after(start, 9000)), [2, 1], "both are down");
+        assert_eq!(keys.act(after(start, 9000)), [Right, Up], "both are down");
         keys.release(&[Right]);
-        assert_eq!(keys.action(spec, after(start, 9000)), [0, 1]);
+        assert_eq!(keys.act(after(start, 9000)), [Up]);
     }
 
     #[test]
@@ -244,6 +218,7 @@ mod tests {
         assert_eq!(press(KeyCode::Char('c')), Some(Command::Move(&[Right, Down])));
         assert_eq!(command(KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL)), Some(Command::Quit));
         assert_eq!(press(KeyCode::PageDown), Some(Command::PreviousSeed));
+        assert_eq!(press(KeyCode::Char('7')), Some(Command::Digit(7)));
         assert_eq!(press(KeyCode::Char('y')), None);
         let release = |code| command(KeyEvent::new_with_kind(code, KeyModifiers::NONE, KeyEventKind::Release));
         assert_eq!(release(KeyCode::Left), Some(Command::Stop(&[Left])));

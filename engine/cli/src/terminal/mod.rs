@@ -1,5 +1,6 @@
 //! Playing and watching in a terminal.
 
+mod controls;
 mod frame;
 mod game;
 mod keys;

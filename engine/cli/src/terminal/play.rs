@@ -10,6 +10,7 @@ use ratatui::layout::Rect;
 
 use super::super::failure::Failure;
 use super::super::stop;
+use super::controls::Controls;
 use super::game::Game;
 use super::keys::{self, Command, Keys};
 use super::picture::fitting;
@@ -23,16 +24,13 @@ const SLICE: Duration = Duration::from_millis(50);
 const HOLD: f64 = 0.15;
 const SLOW_FPS: u32 = 10;
 
-/// Lines below the picture.
-const LINES: u16 = 4;
-
 /// Arguments of `endless play` for the terminal.
 #[derive(clap::Args)]
 pub struct TerminalArgs {
-    /// Play in the terminal, which must show 24-bit colours, at best with 84 columns and 46 lines.
+    /// Play in the terminal, which must show 24-bit colours, at best with 84 columns and 48 lines.
     #[arg(long)]
     pub terminal: bool,
-    /// In the terminal: steps per second, 1 to 100 [default: the original's].
+    /// In the terminal: steps per second, 1 to 100 [default: the environment's].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100), requires = "terminal")]
     fps: Option<u32>,
     /// In the terminal: how long a key acts after the terminal last reported it, in seconds; 0 for one step [default: 0.15; 0 at 10
@@ -44,14 +42,24 @@ pub struct TerminalArgs {
 /// A game that keys control.
 struct Player {
     game: Game,
+    controls: Controls,
     keys: Keys,
-    is_paused: bool,
+    clock: Clock,
     period: Duration,
     /// When the next step is played.
     due: Instant,
 }
 
-/// Plays until a key or a signal ends it.
+/// Whether steps are due.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Clock {
+    /// The episode waits for its first key.
+    Waiting,
+    Running,
+    Paused,
+}
+
+/// Plays until a key or a signal ends it, or the terminal goes away.
 pub fn run(registry: &Registry, id: &str, options: OptionMap, seed: u64, args: &TerminalArgs) -> Result<(), Failure> {
     let fps = args.fps.unwrap_or(registry.spec(id)?.render_fps);
     let hold = args.hold.unwrap_or(if fps > SLOW_FPS { HOLD } else { 0.0 });
@@ -62,11 +70,12 @@ pub fn run(registry: &Registry, id: &str, options: OptionMap, seed: u64, args: &
     let stop = stop::on_signal()?;
     let mut screen = Screen::enter()?;
     let period = Duration::from_secs(1) / fps;
-    let mut player = Player { game, keys: Keys::new(hold), is_paused: false, period, due: Instant::now() + period };
-    while !stop.load(Ordering::Relaxed) {
+    let mut player = Player::new(game, Keys::new(hold), period);
+    let ends = |screen: &Screen| stop.load(Ordering::Relaxed) || screen.is_gone();
+    while !ends(&screen) {
         player.draw(&mut screen)?;
         loop {
-            let (is_running, now) = (!player.is_paused && !player.game.is_over(), Instant::now());
+            let (is_running, now) = (player.is_running(), Instant::now());
             if is_running && now >= player.due {
                 player.step(now)?;
                 break;
@@ -80,7 +89,7 @@ pub fn run(registry: &Registry, id: &str, options: OptionMap, seed: u64, args: &
                 },
                 Some(Event::Resize(..)) => {}
                 Some(_) => continue,
-                None if stop.load(Ordering::Relaxed) => {}
+                None if ends(&screen) => {}
                 None => continue,
             }
             break;
@@ -90,8 +99,18 @@ pub fn run(registry: &Registry, id: &str, options: OptionMap, seed: u64, args: &
 }
 
 impl Player {
+    fn new(game: Game, keys: Keys, period: Duration) -> Self {
+        let controls = Controls::new(game.spec());
+        Player { game, controls, keys, clock: Clock::Waiting, period, due: Instant::now() }
+    }
+
+    /// Whether steps are played without a key.
+    fn is_running(&self) -> bool {
+        self.clock == Clock::Running && self.controls.is_timed() && !self.game.is_over()
+    }
+
     fn step(&mut self, now: Instant) -> Result<(), Failure> {
-        let action = self.keys.action(self.game.spec(), now);
+        let action = self.controls.action(&self.keys.act(now));
         self.game.step(&action)?;
         // After a pause of the process, the game does not catch up.
         self.due = (self.due + self.period).max(now);
@@ -101,24 +120,34 @@ impl Player {
     fn carry_out(&mut self, command: Command) -> Result<(), Failure> {
         let (now, seed) = (Instant::now(), self.game.seed);
         match command {
-            Command::Move(directions) => {
+            Command::Move(directions) if self.controls.press(directions) => {
                 self.keys.press(directions, now);
-                if self.is_paused {
-                    self.step(now)?;
-                    self.keys.clear();
+                if self.clock == Clock::Paused || !self.controls.is_timed() {
+                    self.step_alone(now)?;
                 }
+                self.begin(now);
             }
+            Command::Move(_) => self.begin(now),
             Command::Stop(directions) => self.keys.release(directions),
+            Command::Digit(digit) => {
+                if self.controls.digit(digit) {
+                    self.step_alone(now)?;
+                }
+                self.begin(now);
+            }
+            Command::Select => self.controls.select(),
+            Command::Play if !self.controls.is_timed() && self.controls.can_play_chosen() => self.step_alone(now)?,
+            Command::Play => self.begin(now),
             Command::Pause => {
-                self.is_paused = !self.is_paused;
+                self.clock = if self.clock == Clock::Running { Clock::Paused } else { Clock::Running };
                 self.keys.clear();
                 self.due = now + self.period;
             }
-            Command::OneStep => {
-                self.is_paused = true;
-                self.step(now)?;
-                self.keys.clear();
+            Command::OneStep if self.controls.can_play_chosen() => {
+                self.clock = Clock::Paused;
+                self.step_alone(now)?;
             }
+            Command::OneStep => {}
             Command::Restart => self.restart(seed)?,
             Command::NextSeed => self.restart(seed.saturating_add(1))?,
             Command::PreviousSeed => self.restart(seed.saturating_sub(1))?,
@@ -127,9 +156,25 @@ impl Player {
         Ok(())
     }
 
+    /// Starts the clock of an episode that waits.
+    fn begin(&mut self, now: Instant) {
+        if self.clock == Clock::Waiting {
+            (self.clock, self.due) = (Clock::Running, now);
+        }
+    }
+
+    /// A step that no later one continues.
+    fn step_alone(&mut self, now: Instant) -> Result<(), Failure> {
+        self.step(now)?;
+        self.keys.clear();
+        Ok(())
+    }
+
     fn restart(&mut self, seed: u64) -> Result<(), Failure> {
         self.keys.clear();
-        self.due = Instant::now() + self.period;
+        if self.clock == Clock::Running {
+            self.clock = Clock::Waiting;
+        }
         self.game.restart(seed)
     }
 
@@ -140,20 +185,31 @@ impl Player {
 
     fn lines(&self) -> Result<Vec<String>, Failure> {
         let state = match () {
-            () if self.game.is_over() => "  the episode is over",
-            () if self.is_paused => "  paused",
+            () if self.game.is_over() => "the episode is over",
+            () if !self.controls.is_timed() => "",
+            () if self.clock == Clock::Paused => "paused",
+            () if self.clock == Clock::Waiting => "waits for the first key",
             () => "",
         };
         let spec = self.game.spec();
         let commands = self.game.commands();
         let task = if commands.is_empty() { spec.summary.to_owned() } else { format!("{commands}  {}", spec.summary) };
-        Ok(vec![self.game.numbers() + state, self.game.progress()?, task, keys::HELP.to_owned()])
+        let chosen = Some(self.controls.chosen()).filter(|chosen| !chosen.is_empty());
+        let progress = [state.to_owned(), self.game.progress()?].into_iter().filter(|part| !part.is_empty());
+        let lines = [self.game.numbers(), progress.collect::<Vec<_>>().join("  "), task];
+        Ok(lines.into_iter().chain(chosen).chain([self.controls.help()]).collect())
     }
 }
 
-/// Draws the picture in the middle and the lines below it.
+/// Draws the picture in the middle, or features where there are no frames, and the lines below it.
 fn draw(frame: &mut Frame<'_>, game: &Game, lines: &[String]) {
-    let (above, below) = status::divide(frame.area(), LINES);
+    let area = frame.area();
+    let lines = status::wrapped(lines, area.width);
+    let (above, below) = status::divide(area, lines.len() as u16);
+    status::draw(frame, below, &lines);
+    if game.spec().frame.is_none() {
+        return status::draw(frame, above, &status::wrapped(&[String::new(), game.features()], area.width));
+    }
     let picture = game.frame();
     let side = fitting(above.width, above.height, picture.side);
     if side > 0 {
@@ -161,7 +217,6 @@ fn draw(frame: &mut Frame<'_>, game: &Game, lines: &[String]) {
         let area = Rect::new(above.x + (above.width - columns) / 2, above.y, columns, columns / 2);
         frame.render_widget(&picture.resized(side), area);
     }
-    status::draw(frame, below, lines);
 }
 
 #[cfg(test)]
@@ -177,8 +232,7 @@ mod tests {
 
     fn player(id: &str) -> Player {
         let game = Game::start(memory_gym(), id, OptionMap::new(), 3).unwrap();
-        let (keys, period) = (Keys::new(Duration::ZERO), Duration::from_millis(1));
-        Player { game, keys, is_paused: false, period, due: Instant::now() }
+        Player::new(game, Keys::new(Duration::ZERO), Duration::from_millis(1))
     }
 
     fn length(player: &Player) -> String {
@@ -189,14 +243,18 @@ mod tests {
     fn commands_play_and_restart() {
         let mut player = player("MysteryPath-Grid-v0");
         let start = player.game.frame().pixels;
+        assert!(!player.is_running() && player.lines().unwrap()[1].starts_with("waits for the first key"));
         player.carry_out(Command::Move(&[Direction::Left])).unwrap();
-        assert!(length(&player).contains("step 0"));
+        assert!(player.is_running() && length(&player).contains("step 0"));
         player.step(Instant::now()).unwrap();
         assert!(length(&player).contains("seed 3  step 1"));
         assert!(player.game.frame().pixels != start, "it has turned");
         player.carry_out(Command::OneStep).unwrap();
         player.carry_out(Command::Move(&[Direction::Up])).unwrap();
-        assert!(player.is_paused && length(&player).contains("step 3"), "a paused game plays single steps");
+        assert!(
+            player.clock == Clock::Paused && length(&player).contains("step 3"),
+            "a paused game plays single steps"
+        );
         player.carry_out(Command::Restart).unwrap();
         assert!(player.game.frame().pixels == start && length(&player).contains("seed 3  step 0"));
         player.carry_out(Command::NextSeed).unwrap();
@@ -209,7 +267,7 @@ mod tests {
     fn the_screen_shows_the_frame_and_the_numbers() {
         let player = player("MortarMayhemB-Grid-v0");
         let lines = player.lines().unwrap();
-        assert!(lines[1].starts_with("commands 0 of 10"), "{}", lines[1]);
+        assert_eq!(lines[1], "waits for the first key  commands 0 of 10");
         assert_eq!(lines[2].split("  ").next().unwrap().split(' ').count(), 10, "{}", lines[2]);
         let mut terminal = Terminal::new(TestBackend::new(90, 46)).unwrap();
         terminal.draw(|frame| draw(frame, &player.game, &lines)).unwrap();

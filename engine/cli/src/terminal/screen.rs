@@ -1,7 +1,8 @@
 //! The terminal while a command draws in it, restored however the command ends.
 
 use std::io::{IsTerminal, stdin, stdout};
-use std::time::Duration;
+use std::mem::ManuallyDrop;
+use std::time::{Duration, Instant};
 
 use ratatui::crossterm::cursor::Show;
 use ratatui::crossterm::event::{
@@ -10,12 +11,16 @@ use ratatui::crossterm::event::{
 use ratatui::crossterm::execute;
 use ratatui::crossterm::style::force_color_output;
 use ratatui::{DefaultTerminal, Frame};
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::time::Timespec;
 
 use super::super::failure::Failure;
 use super::super::stop;
 
 /// The alternate screen, in raw mode. Dropping it leaves both, and so do a panic and a second signal.
-pub struct Screen(DefaultTerminal);
+///
+/// `ratatui`'s own clean-up prints its errors, which fails where the terminal was.
+pub struct Screen(ManuallyDrop<DefaultTerminal>);
 
 /// Fails if standard input or standard output is not a terminal.
 pub fn check() -> Result<(), Failure> {
@@ -33,7 +38,7 @@ impl Screen {
         // Pictures consist of colours, so NO_COLOR has no meaning here.
         force_color_output(true);
         stop::before_exit(leave);
-        let entered = ratatui::try_init().map(Screen);
+        let entered = ratatui::try_init().map(|terminal| Screen(ManuallyDrop::new(terminal)));
         let screen = entered.map_err(|error| {
             leave();
             format!("cannot draw in the terminal: {error}")
@@ -45,13 +50,36 @@ impl Screen {
     }
 
     pub fn draw(&mut self, draw: impl FnOnce(&mut Frame<'_>)) -> Result<(), Failure> {
-        self.0.draw(draw).map(drop).map_err(|error| format!("cannot draw in the terminal: {error}").into())
+        let drawn = self.0.draw(draw).map(drop);
+        match drawn {
+            Err(error) if !self.is_gone() => Err(format!("cannot draw in the terminal: {error}").into()),
+            _ => Ok(()),
+        }
     }
 
-    /// The next event, or `None` if there is none within that time.
+    /// The next event, or `None` if there is none within that time, or the terminal has gone away.
     pub fn event(&self, timeout: Duration) -> Result<Option<Event>, Failure> {
-        let read = || if event::poll(timeout)? { event::read().map(Some) } else { Ok(None) };
+        let until = Instant::now() + timeout;
+        let read = || loop {
+            // Reading from a terminal that has gone away, `crossterm` would not return.
+            if self.is_gone() {
+                return Ok(None);
+            }
+            if event::poll(Duration::ZERO)? {
+                return event::read().map(Some);
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            wait(left);
+        };
         read().map_err(|error: std::io::Error| format!("cannot read from the terminal: {error}").into())
+    }
+
+    /// Whether the terminal has gone away: its window was closed, or its session was killed.
+    pub fn is_gone(&self) -> bool {
+        wait(Duration::ZERO).intersects(PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL)
     }
 }
 
@@ -59,6 +87,14 @@ impl Drop for Screen {
     fn drop(&mut self) {
         leave();
     }
+}
+
+/// Waits until the terminal has input or goes away, and returns what happened. A signal ends the wait.
+fn wait(timeout: Duration) -> PollFlags {
+    let input = stdin();
+    let mut watched = [PollFd::new(&input, PollFlags::IN)];
+    let timeout = Timespec::try_from(timeout).unwrap_or_default();
+    poll(&mut watched, Some(&timeout)).map_or(PollFlags::empty(), |_| watched[0].revents())
 }
 
 /// Undoes [`Screen::enter`]. Errors mean that the terminal no longer exists.

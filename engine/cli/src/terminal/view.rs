@@ -36,9 +36,6 @@ const MIN_SIDE: usize = 28;
 /// The largest side of the picture of a small frame.
 const MAX_SIDE: usize = 84;
 
-/// Lines below the pictures.
-const LINES: u16 = 3;
-
 /// Arguments of `endless view` for the terminal.
 #[derive(clap::Args)]
 pub struct TerminalArgs {
@@ -124,7 +121,7 @@ impl Grid {
     }
 }
 
-/// Shows an engine until a key or a signal ends it.
+/// Shows an engine until a key or a signal ends it, or the terminal goes away.
 pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     check()?;
     let timeout = seconds("--timeout", args.timeout)?;
@@ -168,7 +165,7 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     if has_ended { print("the engine has ended") } else { Ok(()) }
 }
 
-/// Checks for keys that quit. Waits for them if there is nothing else to wait for.
+/// Checks for keys that quit, and whether the terminal has gone away. Waits for them if there is nothing else to wait for.
 fn is_quit(screen: &Screen, is_waiting: bool) -> Result<bool, Failure> {
     let mut timeout = if is_waiting { INTERVAL } else { Duration::ZERO };
     while let Some(event) = screen.event(timeout)? {
@@ -181,7 +178,7 @@ fn is_quit(screen: &Screen, is_waiting: bool) -> Result<bool, Failure> {
             }
         }
     }
-    Ok(false)
+    Ok(screen.is_gone())
 }
 
 fn lines(title: &str, statistics: &Statistics, rate: f64, has_ended: bool) -> [String; 2] {
@@ -195,17 +192,21 @@ fn lines(title: &str, statistics: &Statistics, rate: f64, has_ended: bool) -> [S
 }
 
 fn draw(frame: &mut Frame<'_>, wall: &mut Wall, [first, last]: [String; 2]) {
-    let (above, below) = status::divide(frame.area(), LINES);
+    let width = frame.area().width;
+    let total = wall.num_envs * wall.groups;
+    let lines = |wall: &Wall, shown: usize| {
+        let middle = match wall.frames {
+            None => "the engine draws no frames (--no-frames)".to_owned(),
+            Some(_) if wall.seen.is_empty() => "no trainer has stepped the engine since".to_owned(),
+            Some(_) => format!("{shown} of {total} environments are shown"),
+        };
+        status::wrapped(&[first.clone(), middle, last.clone()], width)
+    };
+    let (above, below) = status::divide(frame.area(), lines(wall, total).len() as u16);
     let Grid { columns, rows, .. } = Grid::new(above, usize::MAX, wall.own());
     wall.places = (columns * rows).max(1);
     let shown = wall.draw(frame, above);
-    let total = wall.num_envs * wall.groups;
-    let middle = match wall.frames {
-        None => "the engine draws no frames (--no-frames)".to_owned(),
-        Some(_) if wall.seen.is_empty() => "no trainer has stepped the engine since".to_owned(),
-        Some(_) => format!("{shown} of {total} environments are shown"),
-    };
-    status::draw(frame, below, &[first, middle, last]);
+    status::draw(frame, below, &lines(wall, shown));
 }
 
 #[cfg(test)]
