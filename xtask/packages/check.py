@@ -55,4 +55,8 @@ if sys.argv[2] == "page":
         server.terminate()
     if not is_page or server.returncode:
         sys.exit(f"`endless play` must serve the page and end with status 0, got {server.returncode}")
+    command = [f"{sys.prefix}/bin/endless", "play", "popgym-RepeatFirstEasy-v0"]
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    if refused.returncode != 1 or "is not on the page" not in refused.stderr:
+        sys.exit(f"`endless play` must refuse an environment that is not on the page, got {refused}")
 print(f"CPython {platform.python_version()}: endless-gym {version}, {STEPS} steps in process and served")

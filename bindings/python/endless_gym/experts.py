@@ -44,18 +44,19 @@ class Experts:
         self.num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
         self._native = self._spec.native.Experts(self._spec.id, self.num_envs)
 
-    def act(self, observation: Any, episode_start: Any, active: Any = None) -> NDArray[np.int64]:
+    def act(self, observation: Any, episode_start: Any, active: Any = None) -> NDArray[Any]:
         """Choose the actions. Call it exactly once for each observation, including the first of an episode.
 
         Args:
-            observation: `features`, float32 (n, f); or a dict with `features` and, for the ids with `MortarMayhemB`,
-                `vector_observation`, float32 (n, 180), as a vector environment with `observation="features"` or `"rgb+features"`
+            observation: `features`, float32 (n, f); or a dict with `features` and, for the ids that have one,
+                `vector_observation`, float32 (n, v), as a vector environment with `observation="features"` or `"rgb+features"`
                 returns it.
             episode_start: Whether the observation is the first of an episode, bool (n,).
             active: The environments that need an action, bool (n,); the others' actions are 0. `None` for all.
 
         Returns:
-            Actions int64 in the shape of a vector environment: (n,) for Discrete, (n, branches) for MultiDiscrete.
+            Actions as a vector environment takes them: int64 (n,) for Discrete, int64 (n, branches) for MultiDiscrete,
+            float32 (n, dimensions) for a Box.
 
         Raises:
             ValueError: An array has another shape, or `features` or `vector_observation` is missing.

@@ -94,10 +94,6 @@ class Spec:
     summary: str
     #: The action space as the engine describes it.
     described_actions: dict[str, Any]
-    #: Number of choices of each branch of the action space; none for a Box.
-    branches: tuple[int, ...]
-    #: Whether the action space is MultiDiscrete.
-    multi_discrete: bool
     #: What the numbers of each branch mean: `actions[branch].choices[number]`.
     actions: tuple[ActionBranch, ...]
     #: Width, height and channels of a frame; `None` if the environment has features only.
@@ -138,13 +134,38 @@ class Spec:
             self.id if self.module == _native.__name__ else f"{self.module.rpartition('.')[0] or self.module}:{self.id}"
         )
 
+    @property
+    def branches(self) -> tuple[int, ...]:
+        """Number of choices of each branch of the action space; none for a Box."""
+        described = self.described_actions
+        return (described["Discrete"],) if "Discrete" in described else tuple(described.get("MultiDiscrete", ()))
+
+    @property
+    def multi_discrete(self) -> bool:
+        """Whether the action space is MultiDiscrete."""
+        return "MultiDiscrete" in self.described_actions
+
     def action_space(self) -> gymnasium.Space[Any]:
-        """The original's action space."""
+        """The action space."""
         return _space(self.described_actions)
 
-    def batched_actions(self, actions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Actions with a column for each branch, (n, branches), in the shape of a vector environment: (n,) for Discrete."""
+    def batched_actions(self, actions: NDArray[np.int64]) -> NDArray[Any]:
+        """The engine's actions, (n, branches) or the bits of (n, dimensions), as those of a vector environment."""
+        if "Box" in self.described_actions:
+            return actions.astype(np.int32).view(np.float32)
         return actions if self.multi_discrete else actions[:, 0]
+
+    def random_actions(self, generator: np.random.Generator, n: int) -> NDArray[np.int64]:
+        """Uniformly random actions of the engine, (n, branches) or the bits of (n, dimensions).
+
+        An infinite bound of a Box is replaced by one that is 1000 away from the other, or from 0 if both are infinite.
+        """
+        space = self.action_space()
+        if not isinstance(space, spaces.Box):
+            return generator.integers(self.branches, size=(n, len(self.branches)))
+        low = np.where(np.isfinite(space.low), space.low, np.where(np.isfinite(space.high), space.high - 1000, -1000))
+        high = np.where(np.isfinite(space.high), space.high, np.where(np.isfinite(space.low), space.low + 1000, 1000))
+        return generator.uniform(low, high, (n, *space.shape)).astype(np.float32).view(np.int32).astype(np.int64)
 
     def observation_space(self, frames: Frames | None = Frames(), features: bool = False) -> gymnasium.Space[Any]:
         """The original's observation space, or with the feature observation instead of or beside the frames."""
@@ -289,13 +310,10 @@ def _plain(value: Any) -> Any:
 
 def described_spec(described: dict[str, Any], module: str = _native.__name__) -> Spec:
     """The specification that an engine publishes, or that the native module lists."""
-    actions = described["action_space"]
     return Spec(
         id=described["id"],
         summary=described["summary"],
-        described_actions=actions,
-        branches=(actions["Discrete"],) if "Discrete" in actions else tuple(actions.get("MultiDiscrete", ())),
-        multi_discrete="MultiDiscrete" in actions,
+        described_actions=described["action_space"],
         actions=tuple(ActionBranch(branch["name"], _meanings(branch["choices"])) for branch in described["actions"]),
         frame=None if described["frame"] is None else tuple(described["frame"].values()),
         vector_observation=described["vector_observation"],

@@ -2,15 +2,20 @@
 
 import gzip
 import json
+import threading
+import zlib
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import endless_gym
 from endless_gym.popgym import PreviousAction
+from endless_gym.recording.episodes import Plan, play
+from endless_gym.recording.players import ExpertPlayer, Player, RandomPlayer
 
 REFERENCE = Path(__file__).parents[3] / "tests/reference/popgym"
 IDS = [id for id in endless_gym.all_specs() if id.startswith("popgym-")]
@@ -103,3 +108,33 @@ def test_a_reset_of_some_environments_leaves_the_others_their_actions() -> None:
     envs.step(np.array([3, 2]))
     observation, _ = envs.reset(options={"reset_mask": np.array([False, True])})
     assert (observation[1].tolist(), observation[2].tolist()) == ([3, 0], [0, 1])
+
+
+def test_an_expert_chooses_numbers_of_a_box() -> None:
+    id = "popgym-PositionOnlyPendulumEasy-v0"
+    envs, experts = endless_gym.make_vec(id, 8), endless_gym.Experts(id, 8)
+    observation, _ = envs.reset(seed=0)
+    total = np.zeros(8)
+    for step in range(200):
+        actions = experts.act(observation, np.full(8, step == 0))
+        assert actions.dtype == np.float32 and envs.action_space.contains(actions)
+        observation, reward, *_ = envs.step(actions)
+        total += reward
+    # Doing nothing returns about 0.
+    assert total.min() > 0.7
+
+
+def test_random_actions_replace_those_of_an_expert_in_a_box() -> None:
+    described = endless_gym.spec("popgym-PositionOnlyPendulumEasy-v0")
+
+    def actions(player: Player, rate: float) -> NDArray[np.float32]:
+        plans, stop = [Plan(7, 1, {}, rate, 300)], threading.Event()
+        (episode,) = play(described, player, plans, observation="features", frames=None, action_seed=3, stop=stop)
+        stored = episode.arrays["actions"]
+        assert stored.shape == (200, 1) and stored.dtype == np.float32
+        return np.frombuffer(zlib.decompress(stored.data[0]), np.float32)
+
+    random = actions(RandomPlayer(described), 1.0)
+    assert abs(random.mean()) < 0.3 and -2 <= random.min() < -1.8 and 1.8 < random.max() <= 2
+    shares = [np.mean(actions(ExpertPlayer(described), rate) == random) for rate in (0.0, 0.5, 1.0)]
+    assert shares[0] == 0 and 0.4 < shares[1] < 0.6 and shares[2] == 1

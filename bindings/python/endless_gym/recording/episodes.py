@@ -42,7 +42,7 @@ class Episode:
     Attributes:
         plan: The plan that was played.
         observations: T + 1 observations by their keys.
-        arrays: `actions` int64, `rewards` float64, `terminations` and `truncations` bool, with T rows.
+        arrays: `actions` int64, or float32 of a Box, `rewards` float64, `terminations` and `truncations` bool, with T rows.
         ground_truth: T + 1 rows of `info["ground_truth"]`, float64; `None` if the environment has none.
         length: T.
         total: The return.

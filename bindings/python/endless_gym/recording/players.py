@@ -13,7 +13,7 @@ from endless_gym.specs import ObservationName, Spec
 
 #: Chooses actions. The arguments are the observations of n environments by key, whether each is the first of an episode, bool
 #: (n,), and whether each environment needs an action, bool (n,). Returns actions in the shape of a vector environment.
-Actor: TypeAlias = Callable[[Mapping[str, NDArray[Any]], NDArray[np.bool_], NDArray[np.bool_]], NDArray[np.int64]]
+Actor: TypeAlias = Callable[[Mapping[str, NDArray[Any]], NDArray[np.bool_], NDArray[np.bool_]], NDArray[Any]]
 
 
 class Player(Protocol):
@@ -54,12 +54,12 @@ class RandomPlayer:
 
     def __init__(self, spec: Spec) -> None:
         """Make the player for that environment id."""
-        self._branches = len(spec.branches)
         self._spec = spec
 
     def actor(self, num_envs: int, first_episode: int) -> Actor:
         del first_episode
-        nothing = self._spec.batched_actions(np.zeros((num_envs, self._branches), dtype=np.int64))
+        # An error replaces every one of these.
+        nothing = self._spec.batched_actions(self._spec.random_actions(np.random.default_rng(0), num_envs))
         return lambda observation, episode_start, active: nothing
 
 
@@ -77,9 +77,9 @@ class Errors:
         self._rates = rates
         self._step = 0
         self._wrong = np.zeros((len(episodes), self.STEPS), dtype=np.bool_)
-        self._actions = np.zeros((len(episodes), self.STEPS, len(spec.branches)), dtype=np.int64)
+        self._actions = np.empty(0, dtype=np.int64)
 
-    def apply(self, actions: NDArray[np.int64]) -> NDArray[np.int64]:
+    def apply(self, actions: NDArray[Any]) -> NDArray[Any]:
         """The actions of the next step, in the shape of a vector environment."""
         if not self._rates.any():
             return actions
@@ -87,7 +87,8 @@ class Errors:
         if place == 0:
             for env, generator in enumerate(self._generators):
                 self._wrong[env] = generator.random(self.STEPS) < self._rates[env]
-                self._actions[env] = generator.integers(self._spec.branches, size=self._actions.shape[1:])
+            drawn = [self._spec.random_actions(generator, self.STEPS) for generator in self._generators]
+            self._actions = np.stack(drawn)
         self._step += 1
         wrong = self._wrong[:, place]
         replaced = self._spec.batched_actions(self._actions[:, place])
