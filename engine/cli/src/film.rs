@@ -59,7 +59,7 @@ impl Film {
         Ok(rgb_array(self.batch().observation(), shape))
     }
 
-    /// The ground-truth view. Each call shows the next picture of a clue, as in the original; call it once per step.
+    /// The ground-truth view. Each call may show the next picture of an animation; call it once per step.
     pub fn ground_truth_view(&mut self) -> Result<Picture, Failure> {
         Ok(self.pool.ground_truth_view(0)?)
     }

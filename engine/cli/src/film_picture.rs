@@ -11,7 +11,7 @@ use super::film::Film;
 pub enum View {
     /// What the agent sees.
     Agent,
-    /// The original's debug view, which shows what is hidden from the agent.
+    /// The ground-truth view, which shows what is hidden from the agent.
     GroundTruth,
     /// Both, the agent's view on the left.
     Both,

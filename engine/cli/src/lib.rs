@@ -38,7 +38,7 @@ use endless_gym_core::pool::Registry;
 
 use failure::Failure;
 
-/// Memory Gym environments, bit-exact to the original, served in shared memory.
+/// Environments for reinforcement learning in lockstep, in process and in shared memory.
 ///
 /// Without a command, `endless` runs `endless demo`. The environment variable ENDLESS_GYM_ROOT names the directory in which engines
 /// and trainers find each other [default: /tmp/endless-gym-UID, with the number of the user].
@@ -79,7 +79,7 @@ enum Command {
     /// Actions are random, and resets are included. Each round measures every method once. The result is the median
     /// over the rounds, since other programs on the machine disturb single measurements.
     Bench(bench::Args),
-    /// Replay recorded traces of the original, and compare every observation, reward, flag and info.
+    /// Replay recorded episodes of a reference implementation, and compare every observation, reward, flag and info.
     Verify(verify::Args),
     /// Check environments with random actions: seeds, snapshots, frames, spaces, limits of reset parameters.
     Check(check::Args),

@@ -1,4 +1,4 @@
-//! Memory Gym environments in shared memory: an engine, its trainer and its observers.
+//! Environments in shared memory: an engine, its trainer and its observers.
 //!
 //! An **engine** serves groups of environments under a name. A **trainer** steps them, and **observers** receive the
 //! same batches. They are processes of one user on one host and find each other in a [`Namespace`]. The transport is

@@ -7,8 +7,7 @@ use crate::raster::{FrameShape, PixelFormat};
 /// Maximum number of frames in an observation.
 pub const MAX_STACK: usize = 64;
 
-/// Format of an observation's frames. The default is one frame, uint8, indexed \[x\]\[y\]\[channel\]; for Memory Gym
-/// (84, 84, 3).
+/// Format of an observation's frames. The default is one frame, uint8, indexed \[x\]\[y\]\[channel\].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Frames {

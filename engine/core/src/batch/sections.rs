@@ -191,23 +191,23 @@ macro_rules! batch_sections {
             Observation observation: u8, Frames, optional,
                 "the frames; absent if frames are turned off";
             VectorObservation vector_observation: f32, Vector, optional,
-                "the commands, one-hot; only for ids with `MortarMayhemB`";
+                "the vector observation, 0 to 1; only for ids that have one";
             Features features: f32, Vector, optional,
                 "the content of the frame as numbers, in the order of the environment's specification; on request";
             GroundTruth ground_truth: f64, Vector, optional,
-                "the original's info `ground_truth`; only for ids that have it";
+                "the ground truth, in the order of the environment's specification; only for ids that have one";
             Reward reward: f64, Scalar, required,
                 "reward of this step";
             Terminated terminated: u8, Flag, required,
-                "1 if the task ended the episode in this step; Memory Gym reports its step limit this way too";
+                "1 if the task ended the episode in this step";
             Truncated truncated: u8, Flag, required,
-                "1 if something outside the task ended the episode in this step; always 0 in Memory Gym";
+                "1 if something outside the task ended the episode in this step, such as a step limit";
             EpisodeReturn episode_return: f64, Scalar, required,
                 "sum of the running episode's rewards, including this step";
             EpisodeLength episode_length: i32, Scalar, required,
                 "number of steps of the running episode, including this step";
             Info info: f64, Vector, required,
-                "the original's other final infos, in the order of the environment's specification; 0 in steps that end no episode";
+                "the final infos besides `reward` and `length`, in the order of the environment's specification; 0 in steps that end no episode";
             FinalObservation final_observation: u8, Frames, optional,
                 "`observation` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalVectorObservation final_vector_observation: f32, Vector, optional,

@@ -62,8 +62,8 @@ pub trait Environment: Send + Sync {
     /// `(x, y)` is `(x * height + y) * channels + c`. All bytes are 0 before.
     fn write_pixels(_assets: &Self::Assets, _scene: &Self::Scene, _pixels: &mut [u8]) {}
 
-    /// Draws the original's ground-truth view at the observation's size, before the original scales it up. Advances the
-    /// animations that the original advances with every view.
+    /// Draws the ground-truth view, with what is hidden from the agent, at the size of a frame. Advances the animations that advance with
+    /// every view, if there are any.
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
 
     /// Sets these animations as if the view had been drawn once after the reset and after each earlier step.
@@ -107,7 +107,7 @@ pub trait Environment: Send + Sync {
 pub struct Transition {
     /// The reward, with the precision of a Python float.
     pub reward: f64,
-    /// Whether the task ended the episode. Memory Gym reports every end this way, even one by the step limit.
+    /// Whether the task ended the episode.
     pub terminated: bool,
     /// Whether something outside the task ended the episode, such as a step limit.
     pub truncated: bool,

@@ -1,4 +1,4 @@
-//! Reset parameters: their names and defaults, which are the original's, and the validation of given values.
+//! Reset parameters: their names, defaults and limits, and the validation of given values.
 
 use serde::Serialize;
 use serde_json::{Map, Value as Json};
@@ -13,12 +13,12 @@ const MAX_LIST: usize = 4096;
 pub enum ParameterKind {
     /// A flag.
     Bool {
-        /// The original's default.
+        /// Default.
         default: bool,
     },
     /// An integer.
     Int {
-        /// The original's default.
+        /// Default.
         default: i64,
         /// Least allowed value.
         min: i64,
@@ -27,7 +27,7 @@ pub enum ParameterKind {
     },
     /// A finite number.
     Float {
-        /// The original's default.
+        /// Default.
         default: f64,
         /// Least allowed value.
         min: f64,
@@ -36,7 +36,7 @@ pub enum ParameterKind {
     },
     /// A list of 1 to 4096 integers, from which each episode draws one.
     IntList {
-        /// The original's default.
+        /// Default.
         default: &'static [i64],
         /// Least allowed value of an item.
         min: i64,
@@ -48,7 +48,7 @@ pub enum ParameterKind {
 /// One reset parameter of an environment.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Parameter {
-    /// The original's name.
+    /// Name.
     pub name: &'static str,
     /// Type, default and limits.
     #[serde(flatten)]

@@ -39,9 +39,9 @@ pub struct Column {
 /// A column of the final info (float64).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct InfoColumn {
-    /// The original's key in the final info.
+    /// Key in the final info.
     pub name: &'static str,
-    /// Whether the original's value is a Python int; otherwise it is a float.
+    /// Whether the value is a Python int in the final info; otherwise it is a float.
     pub is_integer: bool,
     /// Meaning and unit.
     pub description: &'static str,
@@ -97,11 +97,11 @@ impl fmt::Display for ObservationSpace {
 /// Everything that is fixed about an environment id.
 #[derive(Clone, Debug, Serialize)]
 pub struct EnvSpec {
-    /// The original's id, such as `MortarMayhem-v0`.
+    /// Id, such as `TMaze-v0`.
     pub id: &'static str,
     /// The agent's task in one line.
     pub summary: &'static str,
-    /// The original's action space.
+    /// Action space.
     pub action_space: ActionSpace,
     /// Size of the frame; `None` if the environment has features only, which every batch then contains.
     pub frame: Option<FrameShape>,
@@ -111,21 +111,21 @@ pub struct EnvSpec {
     pub vector_observation: usize,
     /// Columns of the ground truth (float64); empty if there is none.
     pub ground_truth: &'static [Column],
-    /// Whether the ground truth of a single environment has an integer dtype in the original.
+    /// Whether the ground truth of a single environment has an integer dtype in Python.
     pub ground_truth_is_integer: bool,
     /// The least and the largest number of the ground truth; `None` if it has no bounds.
     pub ground_truth_bounds: Option<(f32, f32)>,
     /// Columns of the final info in addition to `reward` and `length`.
     pub info: &'static [InfoColumn],
-    /// Columns of the feature observation (float32), which the original does not have.
+    /// Columns of the feature observation (float32).
     pub features: &'static [Column],
     /// What the features stand for; `None` for a box without bounds.
     pub observation_space: Option<ObservationSpace>,
-    /// Whether an episode may show what earlier ones left, as in some originals. [`PoolConfig::independent_episodes`] prevents it.
+    /// Whether an episode may show what earlier ones left. [`PoolConfig::independent_episodes`] prevents it.
     ///
     /// [`PoolConfig::independent_episodes`]: crate::pool::PoolConfig::independent_episodes
     pub keeps_state: bool,
-    /// Reset parameters with the original's names and defaults.
+    /// Reset parameters with their defaults and limits.
     pub parameters: &'static [Parameter],
     /// Frames per second for a human viewer.
     pub render_fps: u32,

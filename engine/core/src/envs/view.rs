@@ -1,4 +1,4 @@
-//! The pictures that the original's `render` returns.
+//! The pictures that Gymnasium's `render` returns.
 //!
 //! They are indexed \[row\]\[column\]\[channel\], as in image libraries, while observations are indexed
 //! \[x\]\[y\]\[channel\].
@@ -36,7 +36,7 @@ impl Picture {
     }
 }
 
-/// The ground-truth view of an environment with that frame: the original's `render()` in the mode `debug_rgb_array`.
+/// The ground-truth view of an environment with that frame, enlarged.
 pub(crate) fn ground_truth_view<E: Environment>(env: &mut E, shape: FrameShape) -> Picture {
     let mut frame = vec![0; shape.width * shape.height * 3];
     if shape.channels == 3 {
@@ -48,7 +48,7 @@ pub(crate) fn ground_truth_view<E: Environment>(env: &mut E, shape: FrameShape) 
     Picture::from_columns(&colors(&pixels, shape), shape, SCALE)
 }
 
-/// Converts a frame in the default format to the original's `render()` in the mode `rgb_array`. One channel becomes a shade of grey,
+/// Converts a frame in the default format to Gymnasium's `render()` in the mode `rgb_array`. One channel becomes a shade of grey,
 /// and a fourth one is left out.
 pub fn rgb_array(frame: &[u8], shape: FrameShape) -> Picture {
     Picture::from_columns(&colors(frame, shape), shape, 1)

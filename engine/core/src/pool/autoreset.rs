@@ -28,7 +28,7 @@ pub enum Autoreset {
     NextStep,
     /// In the same step: the observation is the new episode's first; reward, flags and info belong to the old episode.
     SameStep,
-    /// Never: the trainer calls [`Pool::reset`](super::Pool::reset). Until then the episode continues, as in the original.
+    /// Never: the trainer calls [`Pool::reset`](super::Pool::reset). Until then the episode continues.
     Disabled,
 }
 

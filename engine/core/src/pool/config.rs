@@ -10,10 +10,10 @@ use crate::batch::limits::MAX_ENVS;
 use crate::batch::{Contents, Frames, MAX_STACK, batch_layout};
 use crate::envs::{EnvSpec, ResetParameters};
 
-/// Reset parameters by the original's names, as a JSON object.
+/// Reset parameters by name, as a JSON object.
 pub type OptionMap = Map<String, Json>;
 
-/// Reset parameters of a pool's environments. Omitted parameters have the original's defaults.
+/// Reset parameters of a pool's environments. Omitted parameters have their defaults.
 ///
 /// In JSON, an object is [`Shared`](Self::Shared), and a list of objects is [`Each`](Self::Each).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -91,9 +91,8 @@ pub struct PoolConfig {
     pub seeding: Seeding,
     /// Whether an episode depends only on its seed and its reset parameters.
     ///
-    /// If false, as in the original, some environments show what an earlier episode left (the character of Endless Mortar
-    /// Mayhem, the lit circles and the background of Searing Spotlights), and with [`Seeding::Continue`] an episode continues
-    /// the previous one's generator.
+    /// If false, environments whose specification [keeps state](EnvSpec::keeps_state) show what an earlier episode left, and with
+    /// [`Seeding::Continue`] an episode continues the previous one's generator.
     ///
     /// If true, every episode starts as in a new environment, and resets allocate memory. [`Seeding::Continue`] then draws a
     /// seed for each later episode from `SeedSequence(seed, spawn_key=(0,))`, where `seed` is the last seed that the
@@ -142,7 +141,7 @@ impl Serialize for PoolConfig {
 
 impl PoolConfig {
     /// `num_envs` environments of `id` with the defaults: default reset parameters, next-step autoreset, seeds from entropy,
-    /// and the original's frames.
+    /// and frames in the default format.
     pub fn new(id: &str, num_envs: usize) -> Self {
         PoolConfig {
             id: id.to_owned(),

@@ -7,7 +7,7 @@ use super::config::OptionMap;
 /// Reset parameters for the next episodes of some environments.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct NextOptions {
-    /// Reset parameters by the original's names; omitted ones have their defaults.
+    /// Reset parameters by name; omitted ones have their defaults.
     pub options: OptionMap,
     /// Numbers of the environments in their pool.
     pub envs: Vec<usize>,

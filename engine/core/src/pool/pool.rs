@@ -99,7 +99,7 @@ impl Pool {
     }
 
     /// Like [`reset`](Pool::reset), with new reset parameters: the environments that start an episode play it and all later
-    /// ones with `options`. Its keys are the original's names; omitted parameters have their defaults. `None` keeps each
+    /// ones with `options`. Its keys are the parameters' names; omitted parameters have their defaults. `None` keeps each
     /// environment's current parameters.
     ///
     /// # Errors
@@ -346,8 +346,7 @@ impl Pool {
         Ok(self.envs.progress(env))
     }
 
-    /// The ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`, with 4 times
-    /// the width and height of the frame.
+    /// The ground-truth view of one environment, with what is hidden from the agent, at 4 times the width and height of the frame.
     ///
     /// # Errors
     ///

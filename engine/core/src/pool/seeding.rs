@@ -17,8 +17,8 @@ pub(super) const MAX_TOTAL_ENVS: usize = u32::MAX as usize;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Seeding {
-    /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as in the original when
-    /// it is reset without a seed.
+    /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as in Gymnasium when it
+    /// is reset without a seed.
     ///
     /// Under any policy, a reset with an explicit seed `s` restarts the environment's seeds: with `Continue` its later episodes
     /// continue the generator of `s`, with `Range` they draw with `SeedSequence(s, spawn_key=(0,))`, and with `List` they start

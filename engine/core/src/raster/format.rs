@@ -37,8 +37,7 @@ impl FrameShape {
     }
 }
 
-/// Order and kind of the numbers in a frame. The default is that of a [`Canvas`](super::Canvas) and of the original's
-/// observations: \[x\]\[y\]\[channel\].
+/// Order and kind of the numbers in a frame. The default is that of a [`Canvas`](super::Canvas): \[x\]\[y\]\[channel\].
 ///
 /// ```
 /// use endless_gym_core::raster::{FrameShape, PixelFormat};

@@ -1,7 +1,7 @@
-//! Recorded episodes: the format of the original's recordings, their replay in this engine, and recordings of this engine in
-//! that format.
+//! Recorded episodes of an environment's reference implementation: their format, their replay in this engine, and recordings of this
+//! engine in that format.
 //!
-//! A trace file is gzipped JSON: one environment object of the original, which plays several episodes in a row.
+//! A trace file is gzipped JSON: one environment object of the reference, which plays several episodes in a row.
 //!
 //! ```text
 //! {"env": id, "options": {reset parameter: value},

@@ -1,4 +1,4 @@
-//! Recordings of this engine, in the format of the original's traces.
+//! Recordings of this engine, in the format of the traces of a reference implementation.
 
 use std::io::{self, Write};
 
@@ -84,7 +84,7 @@ impl Recorder {
     }
 }
 
-/// The info dictionary as JSON, with the original's types.
+/// The info dictionary as JSON, with the types of Python.
 fn json_info(pool: &Pool, blocks: &[Block], done: bool) -> Map<String, Json> {
     let is_integer =
         |name: &str| name == "length" || pool.spec().info.iter().any(|column| column.name == name && column.is_integer);

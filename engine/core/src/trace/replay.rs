@@ -1,4 +1,4 @@
-//! Replays a trace and compares everything that the original returned.
+//! Replays a trace and compares everything that the reference implementation returned.
 
 use std::fmt;
 
@@ -32,7 +32,7 @@ pub struct Difference {
     pub step: usize,
     /// Which value differs.
     pub what: String,
-    /// The original's value.
+    /// The recorded value.
     pub expected: String,
     /// This engine's value.
     pub found: String,
@@ -121,7 +121,7 @@ pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> 
     Ok(replay)
 }
 
-/// The info dictionary in the original's form, of the pool's only environment.
+/// The info dictionary in the form of a trace, of the pool's only environment.
 pub(super) fn info(pool: &Pool, blocks: &[Block], done: bool) -> Vec<(&'static str, Vec<f64>)> {
     let batch = Batch::new(pool.layout(), blocks);
     let mut info = Vec::new();
