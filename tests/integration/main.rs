@@ -34,6 +34,7 @@ mod support;
 mod terminal;
 mod traces;
 mod view;
+mod web_attacks;
 
 /// The entry point of other tests' child processes; an environment variable names their role.
 #[test]

@@ -286,7 +286,8 @@ fn metrics_are_served_for_prometheus() {
     let mut twin = Twin::new();
     twin.reset(&mut trainer);
     twin.play(&mut trainer, 0..10);
-    let get = |path: &str| http(&address, &format!("GET {path} HTTP/1.1\r\nHost: here\r\nConnection: close\r\n\r\n"));
+    let get =
+        |path: &str| http(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n"));
     let answer = get("/metrics");
     assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("text/plain; version=0.0.4"), "{answer}");
     let body = answer.split("\r\n\r\n").nth(1).unwrap();
@@ -315,8 +316,11 @@ fn metrics_are_served_for_prometheus() {
     }
     assert!(get("/").starts_with("HTTP/1.1 404"));
     assert!(
-        http(&address, "POST /metrics HTTP/1.1\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
-            .starts_with("HTTP/1.1 405")
+        http(
+            &address,
+            &format!("POST /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
+        )
+        .starts_with("HTTP/1.1 405")
     );
     let taken = place.run(&["serve", "--service=other", &format!("--metrics={address}")]);
     assert!(text(&taken.stderr).starts_with(&format!("endless: --metrics {address}: ")), "{}", text(&taken.stderr));

@@ -13,7 +13,6 @@ mod frames;
 mod huge_pages;
 mod list;
 mod logs;
-mod metrics;
 mod new;
 mod open;
 mod options;

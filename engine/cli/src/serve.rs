@@ -2,14 +2,15 @@
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::thread;
 use std::time::Duration;
 
 use endless_gym_core::pool::{Autoreset, PoolConfig, Registry};
 use endless_gym_service::{CheckpointConfig, Engine, EngineConfig, ServiceError};
+use endless_gym_view::MetricsServer;
 use serde::Deserialize;
 
 use super::failure::Failure;
-use super::metrics::Metrics;
 use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
 use super::output::{grouped, print, print_error};
 use super::stop;
@@ -130,7 +131,8 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     if let Some(parent) = args.child {
         stop::with_parent(stop, parent);
     }
-    let metrics = args.metrics.map(Metrics::bind).transpose()?;
+    let bind = |address| MetricsServer::bind(address).map_err(|error| format!("--metrics {address}: {error}"));
+    let metrics = args.metrics.map(bind).transpose()?;
     let mut engine = Engine::new(registry, &config)?;
     if args.child.is_none() {
         let (groups, num_envs) = (config.groups, config.pool.num_envs);
@@ -152,7 +154,14 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
         }
     }
     if let Some(metrics) = metrics {
-        metrics.start(config.namespace.clone(), &config.service)?;
+        let (namespace, service) = (config.namespace.clone(), config.service.clone());
+        let serve = move || {
+            if let Err(error) = metrics.run(namespace, service) {
+                print_error(&error);
+            }
+        };
+        // A thread of its own, so that a slow client delays neither the engine nor the end of the process.
+        thread::Builder::new().name("metrics".to_owned()).spawn(serve)?;
     }
     let summary = loop {
         match engine.run(stop) {

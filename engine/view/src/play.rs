@@ -9,7 +9,7 @@ use form_urlencoded::Serializer;
 use serde_json::{Map, Value as Json};
 
 use crate::error::ViewError;
-use crate::local::{self, LocalPort};
+use crate::server::{self, Port};
 
 /// A service worker that replaces and unregisters one installed earlier at this address. The page's own worker caches
 /// the page for offline use, which is useless with a local server and would outlive the program.
@@ -30,7 +30,7 @@ const WORKER: &str = "addEventListener('install', () => skipWaiting());\n\
 /// ```
 #[derive(Debug)]
 pub struct PlayServer {
-    port: LocalPort,
+    port: Port,
 }
 
 impl PlayServer {
@@ -42,7 +42,7 @@ impl PlayServer {
     /// environment, and [`ViewError::Port`] if the port is taken.
     pub fn bind(port: u16, id: &str) -> Result<Self, ViewError> {
         check(endless_gym_page::engine(), id)?;
-        Ok(PlayServer { port: LocalPort::bind(port)? })
+        Ok(PlayServer { port: Port::local(port)? })
     }
 
     /// The address of an episode: an environment with reset parameters and a seed, or a random seed for `None`.
@@ -56,7 +56,7 @@ impl PlayServer {
     ///
     /// [`ViewError::Server`] if the operating system refuses threads or descriptors.
     pub fn run(self, stop: &AtomicBool) -> Result<(), ViewError> {
-        self.port.serve(Router::new().fallback(answer), stop)
+        self.port.serve(Router::new().fallback(answer), server::is_set(stop))
     }
 }
 
@@ -72,13 +72,13 @@ async fn answer(method: Method, address: Uri) -> Response {
     }
     match address.path() {
         "/" => found("index.html"),
-        "/worker.js" => local::file("worker.js", WORKER.as_bytes()),
+        "/worker.js" => server::file("worker.js", WORKER.as_bytes()),
         path => found(path.strip_prefix('/').unwrap_or_default()),
     }
 }
 
 fn found(name: &str) -> Response {
-    endless_gym_page::file(name).map_or_else(local::not_found, |bytes| local::file(name, bytes))
+    endless_gym_page::file(name).map_or_else(server::not_found, |bytes| server::file(name, bytes))
 }
 
 /// The part after `#` in the address of an episode, as the page's `link.js` reads it. Reset parameters are JSON, but
@@ -115,7 +115,7 @@ mod tests {
         }
         assert_eq!(kind(&answered(Method::GET, "/")), "text/html; charset=utf-8");
         assert_eq!(kind(&answered(Method::HEAD, "/app.js")), "text/javascript; charset=utf-8");
-        assert_eq!(kind(&local::file("engine.wasm", b"")), "application/wasm");
+        assert_eq!(kind(&server::file("engine.wasm", b"")), "application/wasm");
         for path in
             ["/../Cargo.toml", "/files/../index.html", "/%2e%2e/Cargo.toml", "//index.html", "/index.html/", "/x"]
         {

@@ -17,11 +17,12 @@ use axum::routing::get;
 use endless_gym_service::Namespace;
 use serde::Deserialize;
 use serde_json::json;
+use tokio::time::timeout;
 
 use crate::channel::{Channel, Connected};
 use crate::engines;
 use crate::error::ViewError;
-use crate::local::{self, LocalPort};
+use crate::server::{self, Port};
 use crate::watcher;
 
 /// The page's own files. It shares style and icon with the page that plays the environments.
@@ -42,8 +43,11 @@ const MAX_REQUEST: usize = 16 * 1024;
 /// How long to wait until the observers end.
 const END_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Maximum number of engines whose curves are kept.
-const MAX_CHANNELS: usize = 64;
+/// Maximum number of engines that are shown, each by a thread, or whose curves are kept.
+const MAX_CHANNELS: usize = 32;
+
+/// How long a browser may take to receive a message.
+const SEND_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Serves a page that shows the environments of running engines on 127.0.0.1.
 ///
@@ -61,7 +65,7 @@ const MAX_CHANNELS: usize = 64;
 /// # Ok::<(), endless_gym_view::ViewError>(())
 /// ```
 pub struct ViewServer {
-    port: LocalPort,
+    port: Port,
     shared: Arc<Shared>,
 }
 
@@ -85,7 +89,7 @@ impl ViewServer {
         let token = format!("{:032x}", rand::random::<u128>());
         let (service, channels) = (service.map(str::to_owned), Mutex::default());
         let shared = Arc::new(Shared { namespace, service, token, channels });
-        Ok(ViewServer { port: LocalPort::bind(port)?, shared })
+        Ok(ViewServer { port: Port::local(port)?, shared })
     }
 
     /// The address of the page, with the token.
@@ -105,10 +109,10 @@ impl ViewServer {
             .route("/{token}/engines", get(list))
             .route("/{token}/socket", get(socket))
             .route("/{token}/{file}", get(file))
-            .fallback(|| async { local::not_found() })
+            .fallback(|| async { server::not_found() })
             .layer(middleware::from_fn_with_state(Arc::clone(&shared), check_token))
             .with_state(Arc::clone(&shared));
-        let served = self.port.serve(router, stop);
+        let served = self.port.serve(router, server::is_set(stop));
         shared.wait_for_observers();
         served
     }
@@ -142,7 +146,7 @@ async fn check_token(State(shared): State<Arc<Shared>>, request: Request, next: 
     if given.is_some_and(|given| same(given.as_bytes(), shared.token.as_bytes())) {
         next.run(request).await
     } else {
-        local::refuse("the address must have the token that `endless view` has printed")
+        server::refuse("the address must have the token that `endless view` has printed")
     }
 }
 
@@ -161,10 +165,10 @@ async fn file(address: Uri) -> Response {
     if let "style.css" | "icon.svg" = name
         && let Some(bytes) = endless_gym_page::file(name)
     {
-        return local::file(name, bytes);
+        return server::file(name, bytes);
     }
     let found = FILES.iter().find(|(other, _)| *other == name);
-    found.map_or_else(local::not_found, |(name, bytes)| local::file(name, bytes))
+    found.map_or_else(server::not_found, |(name, bytes)| server::file(name, bytes))
 }
 
 /// The running engines, and the one to show first.
@@ -191,6 +195,10 @@ async fn socket(
         let mut channels = shared.channels.lock().unwrap_or_else(PoisonError::into_inner);
         if channels.len() >= MAX_CHANNELS && !channels.contains_key(&wanted.service) {
             channels.retain(|_, channel| Arc::strong_count(channel) > 1);
+            if channels.len() >= MAX_CHANNELS {
+                let why = "pages show too many engines: close some\n";
+                return (StatusCode::SERVICE_UNAVAILABLE, why).into_response();
+            }
         }
         let new = || Arc::new(Channel::new(&shared.namespace, &wanted.service, watcher::run));
         Arc::clone(channels.entry(wanted.service.clone()).or_insert_with(new))
@@ -198,7 +206,10 @@ async fn socket(
     let Some(connected) = channel.connect() else {
         return (StatusCode::SERVICE_UNAVAILABLE, "too many pages show this engine: close some\n").into_response();
     };
-    upgrade.max_message_size(MAX_REQUEST).on_upgrade(move |socket| show(socket, connected, channel))
+    upgrade
+        .max_message_size(MAX_REQUEST)
+        .max_frame_size(MAX_REQUEST)
+        .on_upgrade(move |socket| show(socket, connected, channel))
 }
 
 /// Sends the newest message after the previous one was sent, and the points that the browser's curves lack.
@@ -209,11 +220,11 @@ async fn show(mut socket: WebSocket, mut connected: Connected, channel: Arc<Chan
         tokio::select! {
             changed = connected.messages.changed() => {
                 let message = connected.messages.borrow_and_update().clone();
-                if changed.is_err() || socket.send(Message::Binary(message)).await.is_err() {
+                if changed.is_err() || !send(&mut socket, Message::Binary(message)).await {
                     return;
                 }
                 if let Some(points) = new_points(&channel, &mut known)
-                    && socket.send(Message::text(points)).await.is_err()
+                    && !send(&mut socket, Message::text(points)).await
                 {
                     return;
                 }
@@ -229,6 +240,11 @@ async fn show(mut socket: WebSocket, mut connected: Connected, channel: Arc<Chan
             },
         }
     }
+}
+
+/// Sends a message, and returns whether the browser has received it.
+async fn send(socket: &mut WebSocket, message: Message) -> bool {
+    matches!(timeout(SEND_TIMEOUT, socket.send(message)).await, Ok(Ok(())))
 }
 
 /// The points of the curves since the last call, as JSON.

@@ -1,69 +1,62 @@
 //! Metrics of an engine for Prometheus, served over HTTP.
 
 use std::fmt::Write as _;
+use std::future;
+use std::io;
 use std::net::SocketAddr;
-use std::thread;
 
+use axum::Router;
+use axum::http::StatusCode;
+use axum::http::header::CONTENT_TYPE;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
 use endless_gym_service::{EngineStatus, GroupStatus, Namespace};
-use tiny_http::{Header, Method, Request, Response, Server};
 
-use super::failure::Failure;
+use crate::error::ViewError;
+use crate::server::Port;
 
 /// Prometheus' text format.
-const CONTENT_TYPE: &str = "text/plain; version=0.0.4; charset=utf-8";
+const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 
-/// A metrics server that is bound to its address.
-pub struct Metrics {
-    server: Server,
+/// Serves the metrics of an engine at `/metrics`, from the status that it publishes.
+#[derive(Debug)]
+pub struct MetricsServer {
+    port: Port,
 }
 
-impl Metrics {
-    /// Binds the address.
-    pub fn bind(address: SocketAddr) -> Result<Self, Failure> {
-        let server = Server::http(address).map_err(|error| format!("--metrics {address}: {error}"))?;
-        Ok(Metrics { server })
+impl MetricsServer {
+    /// Binds the address; port 0 for any free one. If the address is of this host only, requests must name it.
+    ///
+    /// # Errors
+    ///
+    /// The operating system's, such as that the port is taken.
+    pub fn bind(address: SocketAddr) -> io::Result<Self> {
+        Ok(MetricsServer { port: Port::bind(address)? })
     }
 
     /// Where the metrics are.
     pub fn url(&self) -> String {
-        format!("http://{}/metrics", self.server.server_addr())
+        format!("{}metrics", self.port.url())
     }
 
-    /// Answers requests in a thread, from the engine's published status, so that a slow client delays neither the
-    /// engine nor the end of the process.
-    pub fn start(self, namespace: Namespace, service: &str) -> Result<(), Failure> {
-        let service = service.to_owned();
-        thread::Builder::new().name("metrics".to_owned()).spawn(move || {
-            for request in self.server.incoming_requests() {
-                let (namespace, service) = (namespace.clone(), service.clone());
-                // Each request has its own thread, since writing to a client that does not read blocks. tiny_http also
-                // has one for each connection.
-                let answer = thread::Builder::new().spawn(move || answer(request, &namespace, &service));
-                if let Err(error) = answer {
-                    tracing::warn!(%error, "cannot answer a request for metrics");
-                }
-            }
-        })?;
-        Ok(())
+    /// Serves until the process ends.
+    ///
+    /// # Errors
+    ///
+    /// [`ViewError::Server`] if the operating system refuses threads or descriptors.
+    pub fn run(self, namespace: Namespace, service: String) -> Result<(), ViewError> {
+        let metrics = move || future::ready(answer(&namespace, &service));
+        let router = Router::new()
+            .route("/metrics", get(metrics))
+            .fallback(|| future::ready((StatusCode::NOT_FOUND, "metrics are at /metrics\n")));
+        self.port.serve(router, future::pending())
     }
 }
 
-fn answer(request: Request, namespace: &Namespace, service: &str) {
-    let is_metrics = request.url().split('?').next() == Some("/metrics");
-    let (status, body) = match request.method() {
-        Method::Get | Method::Head if is_metrics => match EngineStatus::of(namespace, service) {
-            Some(status) => (200, text(&status)),
-            None => (503, "the engine's status cannot be read\n".to_owned()),
-        },
-        Method::Get | Method::Head => (404, "metrics are at /metrics\n".to_owned()),
-        _ => (405, "metrics are read with GET\n".to_owned()),
-    };
-    let mut response = Response::from_string(body).with_status_code(status);
-    if let Ok(header) = Header::from_bytes("Content-Type", CONTENT_TYPE) {
-        response.add_header(header);
-    }
-    if let Err(error) = request.respond(response) {
-        tracing::debug!(%error, "a client of the metrics has left");
+fn answer(namespace: &Namespace, service: &str) -> Response {
+    match EngineStatus::of(namespace, service) {
+        Some(status) => ([(CONTENT_TYPE, TEXT_FORMAT)], text(&status)).into_response(),
+        None => (StatusCode::SERVICE_UNAVAILABLE, "the engine's status cannot be read\n").into_response(),
     }
 }
 
