@@ -39,9 +39,11 @@ impl Toolchain {
         folder.join("bin/rustc").exists().then_some(Toolchain::Debian(folder))
     }
 
-    /// Builds a crate with `cargo build`, and returns the output folder.
+    /// Builds a library as WebAssembly, and returns the output folder. Its manifest does not ask for that type: cargo would then build
+    /// it for every crate that depends on the library, under the same name.
     fn build(&self, arguments: &[&str]) -> Result<PathBuf, String> {
-        let mut cargo = cargo(&["build", "--locked", "--release", "--target", TARGET]);
+        let mut cargo =
+            cargo(&["rustc", "--locked", "--release", "--target", TARGET, "--lib", "--crate-type", "cdylib"]);
         cargo.args(arguments);
         // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
         cargo.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
@@ -130,7 +132,7 @@ fn build_own() -> Result<(), String> {
     let mut page = Command::new(&program);
     page.args(["page", "--manifest-path", "own/Cargo.toml"]).current_dir(&folder);
     Toolchain::find().ok_or(MISSING)?.set(&mut page)?;
-    // As a dependency, `endless-gym-web` would replace the engine of the workspace's page.
+    // In a folder of its own, as for users.
     run(page.env("CARGO_TARGET_DIR", folder.join("target")))
 }
 
