@@ -10,17 +10,22 @@ agent, steps = loaded.agent, loaded.steps
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
+import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
 from endless_gym.specs import spec
+from endless_gym_agents import ranges
 from endless_gym_agents.agent import Agent, make_agent
-from endless_gym_agents.settings import Settings, from_dict
+from endless_gym_agents.settings import Settings, Transformer, from_dict
 
 #: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
 CHECKPOINT_VERSION = 1
@@ -49,6 +54,29 @@ class Checkpoint:
     steps: int
     state: dict[str, Any]
 
+    def resumable(self) -> dict[str, Any]:
+        """The saved state, with everything that a run needs to resume.
+
+        Raises:
+            ValueError: It has only what evaluation needs.
+        """
+        if missing := [name for name in ("optimizer", "generators", "player", "episodes") if name not in self.state]:
+            raise ValueError(
+                f"the checkpoint cannot be resumed: it has no {', '.join(missing)}; start a new run with --init-from"
+            )
+        return self.state
+
+
+@contextlib.contextmanager
+def checked(run: Path) -> Iterator[None]:
+    """Report a state of the last checkpoint of a run that does not fit the run as `ValueError`."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"checkpoint {run / FOLDER / LAST} cannot be resumed, as its state is invalid: {error}"
+        ) from error
+
 
 def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
     """Write a checkpoint as the last one of a run, atomically.
@@ -61,17 +89,31 @@ def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
 
     Returns:
         Path of the last checkpoint.
+
+    Raises:
+        OSError: The file cannot be written, as on a full disk. The former checkpoint stays the last one.
     """
     folder = run / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     last, temporary = folder / LAST, folder / f"{LAST}.new"
-    torch.save({"version": CHECKPOINT_VERSION} | state, temporary)
-    if keep:
-        # A hard link: the same file under a second name.
-        numbered = folder / f"update-{state['update']:06d}.pt"
-        numbered.unlink(missing_ok=True)
-        os.link(temporary, numbered)
-    os.replace(temporary, last)
+    # torch reports a file that cannot be written without the reason.
+    content = io.BytesIO()
+    torch.save({"version": CHECKPOINT_VERSION} | state, content)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        if keep:
+            # A hard link: the same file under a second name.
+            numbered = folder / f"update-{state['update']:06d}.pt"
+            numbered.unlink(missing_ok=True)
+            os.link(temporary, numbered)
+        os.replace(temporary, last)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
     return last
 
 
@@ -90,7 +132,8 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
 
     Raises:
         FileNotFoundError: There is no such checkpoint.
-        ValueError: The file is not a checkpoint of this version, or its weights are not finite.
+        ValueError: The file is not a checkpoint, is truncated or damaged, or of another version, its weights do not fit its
+            settings, or are not finite.
     """
     file = Path(path)
     if file.is_dir():
@@ -99,24 +142,22 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         raise FileNotFoundError(
             f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
         )
-    try:
-        # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
-        state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
-        version = state.get("version")
-        if version == CHECKPOINT_VERSION:
-            settings = from_dict(state["settings"])
-            agent = make_agent(settings, spec(settings.env), device)
-            agent.load_state_dict(state["model"])
-    except (FileNotFoundError, IsADirectoryError, PermissionError):
-        raise
-    except Exception as error:  # `torch.load` and `load_state_dict` raise many types
-        message = f"{path} is not a checkpoint of this version of endless-train; expected a file of a run's folder `checkpoints`"
-        raise ValueError(message) from error
-    if version != CHECKPOINT_VERSION:
+    with file.open("rb") as content:
+        state = _read(content, file)
+    if (version := state.get("version")) != CHECKPOINT_VERSION:
         raise ValueError(
             f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; "
             "use the version of endless-gym that wrote it"
         )
+    if missing := [name for name in ("settings", "update", "steps", "model") if name not in state]:
+        raise ValueError(f"checkpoint {file} is incomplete: it has no {', '.join(missing)}")
+    try:
+        agent, settings = _agent(state, device)
+    except Exception as error:  # of settings of any content, `load_state_dict`, and modules of the user's own
+        reason = str(error).replace("\n\t", " ")
+        raise ValueError(
+            f"checkpoint {file} cannot be used, as its settings or weights are invalid: {reason}"
+        ) from error
     broken = [name for name, weights in agent.state_dict().items() if not bool(weights.isfinite().all())]
     if broken:
         raise ValueError(
@@ -125,6 +166,49 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         )
     agent.eval()
     return Checkpoint(settings, agent, state["update"], state["steps"], state)
+
+
+def _read(content: BinaryIO, file: Path) -> dict[str, Any]:
+    """The saved state, in which nothing has been checked yet except that all of it is as it was written."""
+    try:
+        with zipfile.ZipFile(content) as archive:
+            # `torch.save` does not compress. A small file could have parts that decompress to any size.
+            compressed = [part.filename for part in archive.infolist() if part.compress_type != zipfile.ZIP_STORED]
+            # `torch.load` does not compare the parts with their checksums.
+            damaged = compressed[0] if compressed else archive.testzip()
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{file} is not a checkpoint, or is truncated: {error}") from error
+    if damaged is not None:
+        raise ValueError(f"checkpoint {file} is damaged: its part {damaged} has changed since it was written")
+    content.seek(0)
+    try:
+        # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
+        state = torch.load(content, map_location="cpu", weights_only=True)
+    except Exception as error:  # of many types
+        raise ValueError(f"{file} is not a checkpoint of endless-train: {str(error).splitlines()[0]}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{file} is not a checkpoint of endless-train: it has a {type(state).__name__}, not a dict")
+    return state
+
+
+def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Settings]:
+    """The agent of a saved state, and its settings."""
+    settings, weights = from_dict(state["settings"]), state["model"]
+    ranges.check(settings)
+    for layers in (settings.recurrence.layers, settings.transformer.layers):
+        if layers > max(len(weights), Transformer.layers):
+            raise ValueError(f"{layers} layers need more weights than the checkpoint's {len(weights)}")
+    if not (settings.is_own_agent or settings.encoder):
+        # Without memory for the weights, whose sizes the settings may exaggerate.
+        with torch.device("meta"):
+            expected = make_agent(settings, spec(settings.env), "meta").state_dict()
+        for name, tensor in expected.items():
+            if name in weights and weights[name].shape != tensor.shape:
+                given, wanted = tuple(weights[name].shape), tuple(tensor.shape)
+                raise ValueError(f"{name} must have shape {wanted} according to the settings, got {given}")
+    agent = make_agent(settings, spec(settings.env), device)
+    agent.load_state_dict(weights)
+    return agent, settings
 
 
 def start_from(agent: Agent, path: str | Path) -> str:
@@ -162,5 +246,5 @@ def read_settings(run: str | Path) -> Settings:
         raise FileNotFoundError(f"no run in {run}; expected a folder with {SETTINGS}, as endless-train writes it")
     try:
         return from_dict(json.loads((Path(run) / SETTINGS).read_text()))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{Path(run) / SETTINGS} is not of this version of endless-train ({error})") from None

@@ -93,7 +93,7 @@ def train_rank(
     """The part of `train` that runs while the ranks are connected and the folder `run` is locked."""
     resumed: dict[str, Any] | None = None
     if has_begun:
-        resumed = checkpoint.load(run).state
+        resumed = checkpoint.load(run).resumable()
         check_resumable(settings, checkpoint.read_settings(run))
         settings = dataclasses.replace(settings, resume="", run=str(run))
 
@@ -116,15 +116,16 @@ def train_rank(
         if resumed is not None:
             update, steps = resumed["update"], resumed["steps"]
             agent.load_state_dict(resumed["model"])
-            optimizer.load_state_dict(resumed["optimizer"])
-            for name, generator in generators.items():
-                restore_generator(generator, resumed["generators"][name], settings.seed + update)
-            episodes.extend(resumed["episodes"])
-            players = resumed["player"].get("ranks", [resumed["player"]])
-            if len(players) == ranks.size:
-                collector.load_state_dict(players[ranks.rank])
-            else:
-                collector.start_episodes([player["environments"] for player in players])
+            with checkpoint.checked(run):
+                optimizer.load_state_dict(resumed["optimizer"])
+                for name, generator in generators.items():
+                    restore_generator(generator, resumed["generators"][name], settings.seed + update)
+                episodes.extend(resumed["episodes"])
+                players = resumed["player"].get("ranks", [resumed["player"]])
+                if len(players) == ranks.size:
+                    collector.load_state_dict(players[ranks.rank])
+                else:
+                    collector.start_episodes([player["environments"] for player in players])
         ranks.copy_from_first(agent.state_dict().values())
 
         def save(keep: bool) -> None:

@@ -39,7 +39,7 @@ PROGRAMS = {
         ("endless-eval", "no path given; expected checkpoint files"),
         ("endless-eval nowhere", "no such file or folder: nowhere; expected a checkpoint file"),
         ("endless-eval .", "no checkpoint in .; expected the folder of a run"),
-        ("endless-eval text.pt", "text.pt is not a checkpoint of this version of endless-train"),
+        ("endless-eval text.pt", "text.pt is not a checkpoint, or is truncated: "),
         *(
             (f"endless-train {GRID} --{flag} {given}", f"--{flag} must be {allowed}, got {given}")
             for flag, given, allowed in (

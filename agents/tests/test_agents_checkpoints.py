@@ -1,0 +1,214 @@
+"""Checkpoints that are truncated, damaged, foreign, forged or cannot be written."""
+
+import contextlib
+import dataclasses
+import itertools
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import sys
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from agents_helpers import saved, settings
+
+from endless_gym_agents import checkpoint, train
+from endless_gym_agents.settings import to_dict
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The last checkpoint of a run."""
+    run = tmp_path_factory.mktemp("run")
+    saved(run, settings("gru"))
+    return run / "checkpoints" / "last.pt"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of one update."""
+    run = tmp_path_factory.mktemp("trained") / "run"
+    flags = ["--environment.num-envs", "8", "--ppo.updates", "1", "--ppo.steps", "16", "--recurrence.hidden-size", "16"]
+    arguments = ["--env", "MortarMayhem-Grid-v0", "--preset", "quick", "--run", str(run), *flags]
+    return train.train(train.parse(arguments))
+
+
+def changed(file: Path, to: Path, **state: Any) -> Path:
+    """A whole checkpoint with other entries; `None` removes one."""
+    content = torch.load(file, weights_only=True) | state
+    torch.save({name: part for name, part in content.items() if part is not None}, to)
+    return to
+
+
+def test_a_truncated_checkpoint_is_refused_at_any_length(file: Path, tmp_path: Path) -> None:
+    content = file.read_bytes()
+    for length in {*range(0, 200), *range(0, len(content), 997), *range(len(content) - 200, len(content))}:
+        (tmp_path / "short.pt").write_bytes(content[:length])
+        with pytest.raises(ValueError, match="is not a checkpoint, or is truncated"):
+            checkpoint.load(tmp_path / "short.pt")
+
+
+def test_a_changed_byte_is_reported_or_changes_nothing(file: Path, tmp_path: Path) -> None:
+    content, whole = np.fromfile(file, np.uint8), checkpoint.load(file).state
+    draws, refused = np.random.default_rng(3), 0
+    for _ in range(100):
+        damaged = content.copy()
+        damaged[draws.integers(len(content))] ^= draws.integers(1, 256, dtype=np.uint8)
+        damaged.tofile(tmp_path / "damaged.pt")
+        try:
+            state = checkpoint.load(tmp_path / "damaged.pt").state
+        except ValueError as error:
+            refused += 1
+            assert re.search("damaged|truncated", str(error)), error
+        else:
+            assert all(torch.equal(state["model"][name], part) for name, part in whole["model"].items())
+            assert state["settings"] == whole["settings"] and state["steps"] == whole["steps"]
+    assert refused > 75
+
+
+def test_the_message_names_what_is_wrong(file: Path, tmp_path: Path) -> None:
+    given = torch.load(file, weights_only=True)
+    weights, other = given["model"], settings("gru", recurrence={"hidden_size": 17})
+    name = next(iter(weights))
+    for state, message in [
+        ({"version": 7}, "must be of version 1, got 7"),
+        ({"model": None}, "is incomplete: it has no model"),
+        ({"settings": None, "steps": None}, "is incomplete: it has no settings, steps"),
+        ({"model": weights | {name: torch.full_like(weights[name], torch.nan)}}, f"not finite, in {name}"),
+        ({"model": {key: part for key, part in weights.items() if key != name}}, f'Missing key.*"{name}"'),
+        ({"settings": to_dict(other)}, r"must have shape \(.*17.*\) according to the settings, got"),
+        ({"settings": to_dict(dataclasses.replace(other, env="Other-v0"))}, "id must be one of"),
+        ({"settings": 3}, "settings or weights are invalid"),
+        ({"model": []}, "settings or weights are invalid"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            checkpoint.load(changed(file, tmp_path / "changed.pt", **state))
+    for content, message in [([1], "a list, not a dict"), ({"version": Path()}, "not a checkpoint of endless-train")]:
+        torch.save(content, tmp_path / "changed.pt")
+        with pytest.raises(ValueError, match=message):
+            checkpoint.load(tmp_path / "changed.pt")
+
+
+@pytest.mark.parametrize(
+    "claimed",
+    [
+        {"recurrence": {"layers": 10**9}},
+        {"transformer": {"layers": 10**9}},
+        {"recurrence": {"hidden_size": 10**6}},
+        {"model": {"head_width": 10**7}},
+        {"model": {"body_width": 10**12}},
+    ],
+)
+def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_built(
+    claimed: dict[str, Any], file: Path, tmp_path: Path
+) -> None:
+    forged = changed(file, tmp_path / "forged.pt", settings=to_dict(settings("gru", **claimed)))
+    memory, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    with pytest.raises(ValueError, match=r"settings or weights are invalid"):
+        checkpoint.load(forged)
+    assert time.process_time() - start < 2
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 200_000  # kilobytes
+
+
+def test_a_compressed_checkpoint_is_refused_since_it_could_have_any_size(file: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(file) as source, zipfile.ZipFile(tmp_path / "c.pt", "w", zipfile.ZIP_DEFLATED) as target:
+        for part in source.infolist():
+            target.writestr(part.filename, source.read(part))
+        target.writestr("archive/data/bomb", bytes(300_000_000))
+    with pytest.raises(ValueError, match="is damaged"):
+        checkpoint.load(tmp_path / "c.pt")
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({"optimizer": None, "player": None}, "cannot be resumed: it has no optimizer, player; start a new run"),
+        ({"optimizer": {}}, "cannot be resumed, as its state is invalid"),
+        ({"generators": {"actions": 3}}, "cannot be resumed, as its state is invalid"),
+        ({"player": []}, "cannot be resumed, as its state is invalid"),
+        ({"player": {"environments": b"1"}}, "cannot be resumed, as its state is invalid"),
+        ({"episodes": 3}, "cannot be resumed, as its state is invalid"),
+    ],
+)
+def test_a_checkpoint_without_the_state_of_the_run_cannot_be_resumed(
+    state: dict[str, Any],
+    message: str,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    last = tmp_path / "run" / "checkpoints" / "last.pt"
+    changed(last, last, **state)
+    checkpoint.load(last)
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["endless-train", "--resume", str(tmp_path / "run"), "--ppo.updates", "2"])
+    assert train.main() == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and message in error, error
+
+
+@contextlib.contextmanager
+def forked(work: Callable[[], object]) -> Iterator[int]:
+    """A process that does some work; its id."""
+    if not (process := os.fork()):
+        with contextlib.suppress(Exception):
+            work()
+            os._exit(0)
+        os._exit(1)
+    yield process
+
+
+def test_a_full_disk_leaves_the_former_checkpoint(file: Path, tmp_path: Path) -> None:
+    run, state = tmp_path / "run", torch.load(file, weights_only=True)
+    former = checkpoint.save(run, state, False).read_bytes()
+
+    def save(limit: int) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        with pytest.raises(OSError, match="File too large"):
+            checkpoint.save(run, state | {"steps": 1}, True)
+
+    for limit in (0, 1000, len(former) // 2):
+        with forked(lambda limit=limit: save(limit)) as process:  # type: ignore[misc]
+            assert os.waitpid(process, 0)[1] == 0
+        assert {each.name: each.read_bytes() for each in (run / "checkpoints").iterdir()} == {"last.pt": former}
+
+
+def test_a_kill_while_saving_leaves_a_whole_checkpoint(file: Path, tmp_path: Path) -> None:
+    run, state = tmp_path / "run", torch.load(file, weights_only=True)
+
+    def save() -> None:
+        for number in itertools.count():
+            checkpoint.save(run, state | {"steps": number}, False)
+            (run / "saved").write_text(f"{number:09}")
+
+    for pause in (0, 0.001, 0.003, 0.01):
+        (run / "saved").unlink(missing_ok=True)
+        with forked(save) as process:
+            while not (run / "saved").exists():
+                time.sleep(0.001)
+            time.sleep(pause)
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+        last = int((run / "saved").read_text() or 0)
+        assert checkpoint.load(run).steps in (last, last + 1, 0)
+
+
+def test_deep_settings_are_refused(tmp_path: Path) -> None:
+    for text in ("[" * 100_000, '{"env":' * 100_000, "9" * 10_000):
+        (tmp_path / "settings.json").write_text(text)
+        with pytest.raises(ValueError, match=r"settings\.json is not of this version"):
+            checkpoint.read_settings(tmp_path)
+    with pytest.raises(ValueError, match=r"settings\.json is not of this version"):
+        (tmp_path / "settings.json").write_text(json.dumps({"layers": 10**9}))
+        checkpoint.read_settings(tmp_path)
