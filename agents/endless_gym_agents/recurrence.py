@@ -20,6 +20,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from endless_gym_agents.kernels import KernelGRU, KernelLSTM
+
 
 class PackedGRU(torch.autograd.Function):
     """A GRU layer with the gates of `torch.nn.GRU`."""
@@ -158,7 +160,9 @@ class PackedLSTM(torch.autograd.Function):
         return flat, flat.t() @ before, None, None, None
 
 
-def packed_layers(x: Tensor, weights: Sequence[Sequence[Tensor]], hidden: Tensor, sizes: Sequence[int]) -> Tensor:
+def packed_layers(
+    x: Tensor, weights: Sequence[Sequence[Tensor]], hidden: Tensor, sizes: Sequence[int], native: bool
+) -> Tensor:
     """The outputs of the last of stacked GRU or LSTM layers, float (M, H), with gradients of inputs and weights.
 
     Args:
@@ -167,11 +171,13 @@ def packed_layers(x: Tensor, weights: Sequence[Sequence[Tensor]], hidden: Tensor
         hidden: States before the first steps, float (parts, layers, S, H). A GRU has one part, an LSTM two: hidden state and
             cell state. They get no gradient.
         sizes: Number of sequences that have each step.
+        native: Whether the native kernels compute the layers, which takes float32.
     """
+    gru, lstm = (KernelGRU, KernelLSTM) if native else (PackedGRU, PackedLSTM)
     for layer, (weight_ih, weight_hh, bias_ih, bias_hh) in enumerate(weights):
         if len(hidden) == 1:
-            x = PackedGRU.apply(functional.linear(x, weight_ih, bias_ih), weight_hh, bias_hh, hidden[0, layer], sizes)
+            x = gru.apply(functional.linear(x, weight_ih, bias_ih), weight_hh, bias_hh, hidden[0, layer], sizes)
         else:
             inputs = functional.linear(x, weight_ih, bias_ih + bias_hh)
-            x = PackedLSTM.apply(inputs, weight_hh, hidden[0, layer], hidden[1, layer], sizes)
+            x = lstm.apply(inputs, weight_hh, hidden[0, layer], hidden[1, layer], sizes)
     return x

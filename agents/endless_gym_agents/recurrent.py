@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym_agents.encoders import orthogonal
+from endless_gym_agents.kernels import kernels_are_faster
 from endless_gym_agents.memory import Memory, MemoryState, Minibatch, Minibatches, is_own, shuffled
 from endless_gym_agents.recurrence import packed_layers
 from endless_gym_agents.settings import Recurrence
@@ -180,7 +181,8 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         with self._float32():
             if x.device.type == "cpu":
                 sizes, weights = minibatch.batch_sizes.tolist(), self.recurrent.all_weights
-                y = packed_layers(x, weights, minibatch.initial_hidden, sizes)
+                native = self.settings.kernels == "auto" and kernels_are_faster(self.width)
+                y = packed_layers(x, weights, minibatch.initial_hidden, sizes, native)
             else:
                 hidden = minibatch.initial_hidden
                 sequences = PackedSequence(x, minibatch.batch_sizes)

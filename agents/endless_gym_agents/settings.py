@@ -85,6 +85,9 @@ class Recurrence:
     """fully connected layer before the recurrent layers"""
     sequence_length: Positive = 512
     """length of truncated BPTT in steps; longer segments are cut into sequences that start from stored hidden states"""
+    kernels: Literal["auto", "torch"] = "auto"
+    """how the CPU computes these layers while learning. auto: by native kernels where they are faster, that is with
+    `--threads 1`, or 2 and at most 128 units; torch: by PyTorch's operations"""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from agents_helpers import BRANCHES, ends, make, observations, play, settings, t
 
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.memory import balanced_split
+from endless_gym_agents.recurrent import RecurrentMemory, RecurrentMinibatch
 from endless_gym_agents.settings import PRESETS, Recurrence
 from endless_gym_agents.transformer import Block, TransformerMemory
 
@@ -321,3 +322,15 @@ def _recording(apply, seen):
         return result
 
     return recorded
+
+
+@pytest.mark.parametrize("kind", ["gru", "lstm"])
+def test_the_setting_selects_the_native_kernels(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    names, indices, sizes = [], torch.arange(3), torch.tensor([2, 1])
+    for kernels in ("auto", "torch"):
+        memory = RecurrentMemory(kind, 16, Recurrence(16, kernels=kernels), torch.device("cpu"))
+        hidden = torch.zeros(memory.parts, 1, 2, 16)
+        output = memory(torch.randn(3, 16), RecurrentMinibatch(indices, indices, sizes, hidden))
+        names.append(type(output.grad_fn).__name__)
+    assert names == [f"Kernel{kind.upper()}Backward", f"Packed{kind.upper()}Backward"]

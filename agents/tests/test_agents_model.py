@@ -62,6 +62,7 @@ def test_preset_paper_equals_the_table_of_the_paper() -> None:
         "residual": False,
         "embedding": True,
         "sequence_length": 512,
+        "kernels": "auto",
     }
     assert (trxl.layers, trxl.width, trxl.heads) == (3, 384, 4)
     assert (trxl.initialisation, trxl.positional_encoding) == ("xavier", "absolute")

@@ -13,12 +13,15 @@ SIZES = [sum(length > t for length in LENGTHS) for t in range(max(LENGTHS))]
 
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
-def test_outputs_and_gradients_equal_those_of_pytorch(kind: type[nn.GRU] | type[nn.LSTM], layers: int) -> None:
+@pytest.mark.parametrize("native", [False, True])
+def test_outputs_and_gradients_equal_those_of_pytorch(
+    native: bool, kind: type[nn.GRU] | type[nn.LSTM], layers: int
+) -> None:
     torch.manual_seed(1)
     recurrent = kind(5, 7, layers)
     x = torch.randn(sum(LENGTHS), 5, requires_grad=True)
     hidden = torch.randn(2 if kind is nn.LSTM else 1, layers, len(LENGTHS), 7)
-    output = packed_layers(x, recurrent.all_weights, hidden, SIZES)
+    output = packed_layers(x, recurrent.all_weights, hidden, SIZES, native)
     expected, _ = recurrent(PackedSequence(x, torch.tensor(SIZES)), hidden[0] if kind is nn.GRU else tuple(hidden))
     torch.testing.assert_close(output, expected.data, rtol=0, atol=1e-6)
     weight = torch.randn_like(output)

@@ -77,13 +77,17 @@ vectorised! {
 /// One step of one sequence.
 fn unit_forward(input: &[f32], recurrent: &[f32], saved: &mut [f32], output: &mut [f32]) {
     let width = output.len();
-    let ([x_r, x_z, x_n], [w_r, w_z, w_n]) = (parts(input, width), parts(recurrent, width));
+    // Loops over few arrays, which the compiler proves or checks to be apart, and turns into vector instructions.
+    for i in 0..2 * width {
+        saved[i] = sigmoid(input[i] + recurrent[i]);
+    }
     let [r, z, n, p, before] = parts_mut(saved, width);
+    let ([_, _, x_n], [_, _, w_n]) = (parts(input, width), parts(recurrent, width));
+    p.copy_from_slice(w_n);
     for i in 0..width {
-        r[i] = sigmoid(x_r[i] + w_r[i]);
-        z[i] = sigmoid(x_z[i] + w_z[i]);
-        p[i] = w_n[i];
-        n[i] = tanh(r[i].mul_add(p[i], x_n[i]));
+        n[i] = tanh(r[i].mul_add(w_n[i], x_n[i]));
+    }
+    for i in 0..width {
         output[i] = z[i].mul_add(before[i] - n[i], n[i]);
     }
 }
@@ -147,19 +151,27 @@ pub fn backward(
 }
 
 vectorised! {
-/// One step of one sequence. `carry` is the gradient of `h` from the step after, and then `g z`.
+/// One step of one sequence. `carry` is the gradient of `h` from the step after, then `g`, and then `g z`.
 fn unit_backward(saved: &[f32], grad_output: &[f32], carry: &mut [f32], grad_input: &mut [f32], delta: &mut [f32]) {
     let width = grad_output.len();
     let carry = &mut carry[..width];
     let [r, z, n, p, before] = parts(saved, width);
-    let ([x_r, x_z, x_n], [w_r, w_z, w_n]) = (parts_mut(grad_input, width), parts_mut(delta, width));
+    let [x_r, x_z, x_n] = parts_mut(grad_input, width);
     for i in 0..width {
-        let g = grad_output[i] + carry[i];
-        carry[i] = g * z[i];
-        x_n[i] = g * (1.0 - z[i]) * (1.0 - n[i] * n[i]);
-        x_r[i] = x_n[i] * p[i] * r[i] * (1.0 - r[i]);
-        x_z[i] = g * (before[i] - n[i]) * z[i] * (1.0 - z[i]);
-        (w_r[i], w_z[i], w_n[i]) = (x_r[i], x_z[i], x_n[i] * r[i]);
+        carry[i] += grad_output[i];
+        x_n[i] = carry[i] * (1.0 - z[i]) * (1.0 - n[i] * n[i]);
     }
+    for i in 0..width {
+        x_r[i] = x_n[i] * p[i] * r[i] * (1.0 - r[i]);
+    }
+    for i in 0..width {
+        x_z[i] = carry[i] * (before[i] - n[i]) * z[i] * (1.0 - z[i]);
+        carry[i] *= z[i];
+    }
+    let (gates, candidate) = delta.split_at_mut(2 * width);
+    for i in 0..width {
+        candidate[i] = x_n[i] * r[i];
+    }
+    gates.copy_from_slice(&grad_input[..2 * width]);
 }
 }

@@ -81,12 +81,19 @@ fn unit_forward(gates: &[f32], saved: &mut [f32], output: &mut [f32], cell: &mut
     let cell = &mut cell[..width];
     let [x_i, x_f, x_g, x_o] = parts(gates, width);
     let [i, f, g, o, squashed, before, _] = parts_mut(saved, width);
+    // Loops over few arrays: see the GRU.
     for j in 0..width {
         i[j] = sigmoid(x_i[j]);
         f[j] = sigmoid(x_f[j]);
+    }
+    for j in 0..width {
         g[j] = tanh(x_g[j]);
         o[j] = sigmoid(x_o[j]);
+    }
+    for j in 0..width {
         cell[j] = f[j].mul_add(before[j], i[j] * g[j]);
+    }
+    for j in 0..width {
         squashed[j] = tanh(cell[j]);
         output[j] = o[j] * squashed[j];
     }
@@ -152,7 +159,8 @@ pub fn backward(
 }
 
 vectorised! {
-/// One step of one sequence. `carry` and `carry_cell` are the gradients of `h` and `c` from the step after, and then 0 and `dc f`.
+/// One step of one sequence. `carry` and `carry_cell` are the gradients of `h` and `c` from the step after, and then 0 and `dc f`;
+/// in between, `carry_cell` is `dc`.
 fn unit_backward(
     saved: &[f32],
     grad_output: &[f32],
@@ -166,13 +174,17 @@ fn unit_backward(
     let [x_i, x_f, x_g, x_o] = parts_mut(grad_input, width);
     for j in 0..width {
         let a = grad_output[j] + carry[j];
-        let dc = carry_cell[j] + a * o[j] * (1.0 - squashed[j] * squashed[j]);
         carry[j] = 0.0;
-        carry_cell[j] = dc * f[j];
-        x_i[j] = dc * g[j] * i[j] * (1.0 - i[j]);
-        x_f[j] = dc * before[j] * f[j] * (1.0 - f[j]);
-        x_g[j] = dc * i[j] * (1.0 - g[j] * g[j]);
+        carry_cell[j] += a * o[j] * (1.0 - squashed[j] * squashed[j]);
         x_o[j] = a * squashed[j] * o[j] * (1.0 - o[j]);
+    }
+    for j in 0..width {
+        x_i[j] = carry_cell[j] * g[j] * i[j] * (1.0 - i[j]);
+        x_g[j] = carry_cell[j] * i[j] * (1.0 - g[j] * g[j]);
+    }
+    for j in 0..width {
+        x_f[j] = carry_cell[j] * before[j] * f[j] * (1.0 - f[j]);
+        carry_cell[j] *= f[j];
     }
 }
 }

@@ -60,21 +60,6 @@ impl<'a> Matrix<'a> {
     pub(crate) fn data(&self) -> &'a [f32] {
         self.data
     }
-
-    /// Copies some columns of up to six rows, column by column.
-    #[inline(always)]
-    fn pack_rows(&self, rows: Range<usize>, columns: Range<usize>, packed: &mut [[f32; ROWS]]) {
-        for (packed, column) in packed.iter_mut().zip(columns) {
-            let start = rows.start * self.row_stride + column * self.column_stride;
-            if self.row_stride == 1 && rows.len() == ROWS {
-                packed.copy_from_slice(&self.data[start..start + ROWS]);
-            } else {
-                for (i, packed) in packed[..rows.len()].iter_mut().enumerate() {
-                    *packed = self.data[start + i * self.row_stride];
-                }
-            }
-        }
-    }
 }
 
 /// The right matrix of products, in panels of 16 columns. It keeps its memory when it is packed again.
@@ -144,9 +129,7 @@ fn add_tiles(sum: &mut [f32], left: Matrix, right: &Packed) {
             // Tiles of about the same height: 4 and 4 rows rather than 6 and 2.
             let tile_rows =
                 |tile: usize| rows.start + tile * rows.len() / tiles..rows.start + (tile + 1) * rows.len() / tiles;
-            for (tile, packed) in stack[..tiles].iter_mut().enumerate() {
-                left.pack_rows(tile_rows(tile), depth.clone(), packed);
-            }
+            pack_tiles(left, depth.clone(), &mut stack[..tiles], tile_rows);
             for (columns, panel) in blocks(width, COLUMNS).zip(panels.chunks_exact(depth.len())) {
                 for (tile, packed) in stack[..tiles].iter().enumerate() {
                     let rows = tile_rows(tile);
@@ -166,6 +149,33 @@ fn add_tiles(sum: &mut [f32], left: Matrix, right: &Packed) {
 }
 }
 
+/// Copies rows of some columns to tiles, column by column, in the order in which they are in memory.
+#[inline(always)]
+fn pack_tiles(
+    left: Matrix,
+    columns: Range<usize>,
+    tiles: &mut [[[f32; ROWS]; DEPTH]],
+    rows: impl Fn(usize) -> Range<usize>,
+) {
+    if left.row_stride == 1 {
+        for (k, column) in columns.enumerate() {
+            for (tile, packed) in tiles.iter_mut().enumerate() {
+                let rows = rows(tile);
+                let from = &left.data[column * left.column_stride..][rows.clone()];
+                copy::<ROWS>(from, &mut packed[k][..rows.len()]);
+            }
+        }
+    } else {
+        for (tile, packed) in tiles.iter_mut().enumerate() {
+            for (i, row) in rows(tile).enumerate() {
+                for (packed, column) in packed.iter_mut().zip(columns.clone()) {
+                    packed[i] = left.data[row * left.row_stride + column * left.column_stride];
+                }
+            }
+        }
+    }
+}
+
 /// Adds the product of the first `R` columns of `left`, transposed, and `right` to a tile that begins at `sum[0]`.
 #[inline(always)]
 fn add_tile<const R: usize>(
@@ -177,7 +187,7 @@ fn add_tile<const R: usize>(
 ) {
     let mut tile = [[0.0; COLUMNS]; R];
     for (tile, sum) in tile.iter_mut().zip(sum.chunks(stride)) {
-        copy(&sum[..columns], &mut tile[..columns]);
+        copy::<COLUMNS>(&sum[..columns], &mut tile[..columns]);
     }
     for (left, right) in left.iter().zip(right) {
         for (tile, left) in tile.iter_mut().zip(left) {
@@ -185,14 +195,14 @@ fn add_tile<const R: usize>(
         }
     }
     for (tile, sum) in tile.iter().zip(sum.chunks_mut(stride)) {
-        copy(&tile[..columns], &mut sum[..columns]);
+        copy::<COLUMNS>(&tile[..columns], &mut sum[..columns]);
     }
 }
 
-/// Copies a row of a tile, most often a full one, which is then two vectors.
+/// Copies up to `N` numbers, most often `N`, for which it needs no loop.
 #[inline(always)]
-fn copy(from: &[f32], to: &mut [f32]) {
-    match (from.first_chunk::<COLUMNS>(), to.first_chunk_mut::<COLUMNS>()) {
+fn copy<const N: usize>(from: &[f32], to: &mut [f32]) {
+    match (from.first_chunk::<N>(), to.first_chunk_mut::<N>()) {
         (Some(from), Some(to)) => *to = *from,
         _ => to.copy_from_slice(from),
     }

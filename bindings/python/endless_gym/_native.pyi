@@ -107,3 +107,62 @@ def ended_episodes(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.int32], list[NDArray[Any]]] | None: ...
 def endless(arguments: Sequence[str], executable: Sequence[str]) -> int: ...
 def specs() -> str: ...
+
+# The kernels of `endless-gym-kernels`: contiguous float32 arrays, of which the last ones are overwritten, as that crate says.
+Numbers = NDArray[np.float32]
+
+def gru_forward(
+    inputs: Numbers,
+    weight: Numbers,
+    bias: Numbers,
+    state: Numbers,
+    sizes: Sequence[int],
+    resets: Sequence[bool],
+    saved: Numbers,
+    outputs: Numbers,
+) -> None: ...
+def gru_backward(
+    weight: Numbers,
+    saved: Numbers,
+    grad_outputs: Numbers,
+    sizes: Sequence[int],
+    resets: Sequence[bool],
+    grad_inputs: Numbers,
+    grad_weight: Numbers,
+    grad_bias: Numbers,
+    grad_state: Numbers,
+) -> None: ...
+def lstm_forward(
+    inputs: Numbers,
+    weight: Numbers,
+    hidden: Numbers,
+    cell: Numbers,
+    sizes: Sequence[int],
+    resets: Sequence[bool],
+    saved: Numbers,
+    outputs: Numbers,
+    cells: Numbers,
+) -> None: ...
+def lstm_backward(
+    weight: Numbers,
+    saved: Numbers,
+    grad_outputs: Numbers,
+    sizes: Sequence[int],
+    resets: Sequence[bool],
+    grad_inputs: Numbers,
+    grad_weight: Numbers,
+    grad_hidden: Numbers,
+    grad_cell: Numbers,
+) -> None: ...
+def mingru_forward(
+    inputs: Numbers, state: Numbers, sizes: Sequence[int], resets: Sequence[bool], saved: Numbers, outputs: Numbers
+) -> None: ...
+def mingru_backward(
+    inputs: Numbers,
+    saved: Numbers,
+    grad_outputs: Numbers,
+    sizes: Sequence[int],
+    resets: Sequence[bool],
+    grad_inputs: Numbers,
+    grad_state: Numbers,
+) -> None: ...

@@ -18,6 +18,8 @@ mod connection;
 mod ends;
 mod errors;
 mod experts;
+#[cfg(feature = "native")]
+mod kernels;
 mod logs;
 mod observer;
 mod pool;
@@ -57,6 +59,12 @@ fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) 
 #[cfg(feature = "native")]
 #[pymodule(name = "_native")]
 fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_function(wrap_pyfunction!(kernels::gru_forward, module)?)?;
+    module.add_function(wrap_pyfunction!(kernels::gru_backward, module)?)?;
+    module.add_function(wrap_pyfunction!(kernels::lstm_forward, module)?)?;
+    module.add_function(wrap_pyfunction!(kernels::lstm_backward, module)?)?;
+    module.add_function(wrap_pyfunction!(kernels::mingru_forward, module)?)?;
+    module.add_function(wrap_pyfunction!(kernels::mingru_backward, module)?)?;
     populate(module, Ok(endless_gym::environments().clone()))
 }
 
