@@ -71,8 +71,8 @@ impl Task for MultiarmedBandit {
     }
 
     fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {
-        for (out, arm) in out.iter_mut().zip(self.arms) {
-            *out = arm.into();
+        for (out, arm) in out.iter_mut().zip(&self.arms) {
+            *out = f64::from(*arm);
         }
     }
 
