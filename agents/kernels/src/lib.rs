@@ -1,19 +1,25 @@
-//! Layers of neural networks with their gradients, for learning on the CPU: fully connected layers, GRU, LSTM and minGRU.
+//! What a learner computes on the CPU, with gradients: layers (fully connected, GRU, LSTM, minGRU, layer normalisation), categorical
+//! policies, the losses of PPO, AdamW, and orthogonal initial weights.
 //!
 //! Each module has the functions `forward` and `backward` of one layer, with its equations. The caller owns all memory: weights,
 //! outputs, gradients, and workspaces, which grow in the first call. Later calls with the same shapes do not allocate. Numbers are
 //! f32, and matrices are stored row by row.
 //!
-//! The outputs and gradients equal those of PyTorch up to rounding; `agents/tests/test_agents_kernels.py` compares them. All sums have
-//! a fixed order, and the results are the same on every CPU.
+//! The outputs and gradients equal those of PyTorch up to rounding: `agents/tests/test_agents_kernels.py` compares the recurrent
+//! layers, and `tests/learning.rs` the rest. All sums have a fixed order.
 
 #![deny(unsafe_code)]
 
+pub mod adamw;
+pub mod categorical;
 pub mod functions;
 pub mod gru;
+pub mod layer_norm;
 pub mod linear;
 pub mod lstm;
 pub mod matrix;
 pub mod mingru;
+pub mod orthogonal;
+pub mod ppo;
 pub mod sequences;
 mod vectors;
