@@ -9,8 +9,14 @@ envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # a ve
 ```
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+if "free-threading" in sys.version:
+    raise ImportError(
+        "endless_gym does not support free-threaded builds of CPython; use one with the GIL, such as python3.14"
+    )
 
 from endless_gym._native import __version__, running_engines
 from endless_gym.env import Env

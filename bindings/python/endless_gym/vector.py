@@ -6,7 +6,7 @@ import contextlib
 import threading
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
 import numpy as np
@@ -450,6 +450,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def __reduce__(self) -> NoReturn:
+        """Vector environments cannot be pickled or copied: only one process and one object steps them."""
+        raise TypeError(
+            "vector environments cannot be pickled or copied; make them in the process that steps them, as by a function that "
+            "calls `make_vec`, `serve` or `connect`, copy episodes with `snapshot` and `restore`, or pickle an `Env`"
+        )
 
     def _env(self, given: int) -> int:
         return integer("env", given, 0, self.num_envs - 1)

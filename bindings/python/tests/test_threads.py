@@ -2,10 +2,12 @@
 
 import asyncio
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 import endless_gym
@@ -53,6 +55,32 @@ def test_other_threads_render_and_save_while_one_steps(where: Any) -> None:
             for observer in observers:
                 observer.result()
         assert shown and set(shown) == {(84, 84, 3)}
+
+
+def test_calls_of_other_threads_succeed_while_one_waits_for_a_stopped_engine() -> None:
+    with endless_gym.serve(ID, 4, groups=2) as envs, ThreadPoolExecutor(2) as threads:
+        for group in range(2):
+            envs.reset(group=group)
+        snapshot = envs.snapshot(0)
+        calls = [
+            lambda: envs.reconnect(),
+            lambda: envs.restore({0: snapshot}),
+            lambda: envs.running_episodes(),
+            lambda: (envs.send(ACTIONS, 0), envs.recv(0)),
+        ]
+        (engine,) = psutil.Process().children()
+        for call in calls:
+            engine.suspend()
+            envs.send(ACTIONS, 1)
+            waiting = threads.submit(envs.recv, 1)
+            other = threads.submit(call)
+            time.sleep(0.1)
+            assert not waiting.done()
+            with pytest.raises(RuntimeError, match="group 1 has a pending answer"):
+                envs.restore({0: snapshot}, 1)
+            engine.resume()
+            assert waiting.result(30)[4]["group"] == 1
+            other.result(30)
 
 
 @pytest.mark.parametrize("where", WHERE)

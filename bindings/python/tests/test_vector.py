@@ -1,6 +1,10 @@
 """Vector environments in this process and in an engine process have the same class and the same results."""
 
+import copy
 import gc
+import pickle
+import subprocess
+import sys
 
 import gymnasium
 import numpy as np
@@ -104,6 +108,22 @@ def test_holding_too_many_batches_raises_and_says_what_to_do() -> None:
         gc.collect()
         envs.recv(0)
         envs.step(np.zeros((2, 2), dtype=np.int64))
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_pickle_and_copy_are_refused_with_what_to_do_instead(where) -> None:
+    with where(ID, 2) as envs:
+        for copied in (pickle.dumps, copy.copy, copy.deepcopy):
+            with pytest.raises(
+                TypeError, match="vector environments cannot be pickled or copied; make them in the process"
+            ):
+                copied(envs)
+
+
+def test_free_threaded_builds_are_refused_at_import() -> None:
+    code = "import sys; sys.version = '3.14.0 free-threading build (main)'; import endless_gym"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "\nImportError: endless_gym does not support free-threaded builds of CPython; use one with" in done.stderr
 
 
 @pytest.mark.parametrize("where", WHERE)
