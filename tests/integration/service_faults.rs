@@ -306,6 +306,24 @@ fn few_descriptors_are_an_error_or_enough() {
 }
 
 #[test]
+fn limits_of_memory_and_files_are_named_and_nothing_is_left() {
+    let place = Place::new();
+    for (option, limits) in [("-v", &[45_000, 80_000, 110_000][..]), ("-f", &[0, 16, 64, 1000])] {
+        for limit in limits {
+            let mut command = place.command("bash");
+            command.args(["-c", &format!("ulimit {option} {limit} && exec \"$0\" \"$@\"")]);
+            command.arg(env!("CARGO_BIN_EXE_endless")).args(["serve", "--env", ID, "--num-envs=512", "--threads=1"]);
+            let mut engine = Process::spawn(command.stdout(Stdio::null()).stderr(Stdio::piped()));
+            let text = engine.errors();
+            assert_eq!(engine.wait().code(), Some(1), "{option} {limit}: {text}");
+            let is_named = text.contains(&format!("`ulimit {option}`")) || text.contains("File too large");
+            assert!(is_named && text.lines().count() == 1, "{option} {limit}: {text}");
+            place.assert_nothing_left();
+        }
+    }
+}
+
+#[test]
 fn a_shared_directory_is_refused_without_advising_chmod() {
     let error = running_engines(&Namespace::at("/tmp")).unwrap_err().to_string();
     assert!(error.contains("shared with other users") && !error.contains("chmod"), "{error}");

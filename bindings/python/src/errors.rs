@@ -69,7 +69,9 @@ pub fn service(error: ServiceError) -> PyErr {
         | E::OptionsTooLong { .. }
         | E::SnapshotTooLong { .. }
         | E::Rejected { .. } => PyValueError::new_err(text),
-        E::Root { .. } | E::ForeignSegment { .. } | E::DescriptorLimit { .. } => PyOSError::new_err(text),
+        E::Root { .. } | E::ForeignSegment { .. } | E::DescriptorLimit { .. } | E::ResourceLimit { .. } => {
+            PyOSError::new_err(text)
+        }
         _ => PyRuntimeError::new_err(text),
     }
 }

@@ -34,6 +34,7 @@ use std::ffi::OsString;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use endless_gym_core::pool::Registry;
+use nix::sys::signal::{SigSet, Signal};
 
 use failure::Failure;
 
@@ -111,6 +112,8 @@ const FAILURE: u8 = 1;
 /// command clears.
 pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
     engine_process::set_executable(executable);
+    // A file that grows beyond the limit of its size is an error, instead of the end of this process without cleanup.
+    let _ = SigSet::from(Signal::SIGXFSZ).thread_block();
     let mut arguments: Vec<_> = std::iter::once("endless".into()).chain(arguments).collect();
     let parse = |arguments: &[OsString]| {
         Cli::from_arg_matches(&command(registry).try_get_matches_from(arguments)?).map_err(Failure::from)

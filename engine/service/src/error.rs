@@ -10,6 +10,7 @@ use endless_gym_core::pool::{PoolError, ResumeError, SnapshotError};
 use thiserror::Error;
 
 use crate::namespace::process::LockHolder;
+use crate::namespace::resource_limits;
 
 /// Version of this package, for messages about versions that differ.
 pub(crate) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -303,6 +304,16 @@ pub enum ServiceError {
     /// The environments could not be saved, or not continued from a checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// iceoryx2 failed in a process whose memory or files are limited.
+    #[error("{action}, and {limits}; raise the limit, or use fewer environments or groups ({reason})")]
+    ResourceLimit {
+        /// What failed.
+        action: &'static str,
+        /// The limits (`RLIMIT_AS`, `RLIMIT_FSIZE`).
+        limits: String,
+        /// iceoryx2's error.
+        reason: String,
+    },
     /// An unexpected error of iceoryx2.
     #[error("{action}: {reason}")]
     Middleware {
@@ -316,7 +327,13 @@ pub enum ServiceError {
 impl ServiceError {
     /// Wraps an iceoryx2 error that has no variant of its own.
     pub(crate) fn middleware<E: fmt::Display>(action: &'static str) -> impl Fn(E) -> Self {
-        move |error| ServiceError::Middleware { action, reason: error.to_string() }
+        move |error| {
+            let reason = error.to_string();
+            match resource_limits::text() {
+                Some(limits) => ServiceError::ResourceLimit { action, limits, reason },
+                None => ServiceError::Middleware { action, reason },
+            }
+        }
     }
 
     /// The error for an engine that was built with another version of iceoryx2.

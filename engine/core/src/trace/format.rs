@@ -14,6 +14,10 @@ use thiserror::Error;
 
 use crate::pool::PoolError;
 
+/// Maximum length of a trace's JSON in bytes, so that a small file that decompresses to any length does not exhaust memory. The
+/// longest trace of the reference implementation has 2.4 MB.
+const MAX_BYTES: u64 = 64 << 20;
+
 /// One recorded environment object.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct Trace {
@@ -119,7 +123,7 @@ impl Trace {
     ///
     /// # Errors
     ///
-    /// [`TraceError::Open`], [`TraceError::Format`], [`TraceError::Empty`] or [`TraceError::Truncated`].
+    /// [`TraceError::Open`], [`TraceError::Format`], [`TraceError::TooLong`], [`TraceError::Empty`] or [`TraceError::Truncated`].
     pub fn open(path: &Path) -> Result<Self, TraceError> {
         Self::read(File::open(path).map_err(TraceError::Open)?)
     }
@@ -128,9 +132,14 @@ impl Trace {
     ///
     /// # Errors
     ///
-    /// [`TraceError::Format`], [`TraceError::Empty`] or [`TraceError::Truncated`].
+    /// [`TraceError::Format`], [`TraceError::TooLong`], [`TraceError::Empty`] or [`TraceError::Truncated`].
     pub fn read(file: impl Read) -> Result<Self, TraceError> {
-        let trace: Self = serde_json::from_reader(BufReader::new(GzDecoder::new(file))).map_err(TraceError::Format)?;
+        let mut text = GzDecoder::new(file).take(MAX_BYTES);
+        let trace: Result<Self, _> = serde_json::from_reader(BufReader::new(&mut text));
+        if text.limit() == 0 {
+            return Err(TraceError::TooLong);
+        }
+        let trace = trace.map_err(TraceError::Format)?;
         trace.check_complete()?;
         Ok(trace)
     }
@@ -177,6 +186,9 @@ pub enum TraceError {
     /// The file's content is not a trace.
     #[error("the file must be a trace (gzipped JSON): {0}")]
     Format(serde_json::Error),
+    /// The file's content is too long.
+    #[error("the trace must have fewer than {MAX_BYTES} bytes after decompression; record fewer episodes in each file")]
+    TooLong,
     /// There are no episodes.
     #[error("the trace must have at least one episode, got none")]
     Empty,
@@ -196,4 +208,25 @@ pub enum TraceError {
     /// The environment does not exist, or the recorded reset parameters or actions are invalid.
     #[error(transparent)]
     Pool(#[from] PoolError),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn compressed(text: impl Read) -> Vec<u8> {
+        let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
+        io::copy(&mut { text }, &mut encoder).unwrap();
+        encoder.finish().unwrap()
+    }
+
+    #[test]
+    fn small_files_of_long_or_deep_content_are_refused() {
+        let start = &br#"{"env":"MysteryPath-v0","options":{},"episodes":["#[..];
+        let long = compressed(start.chain(io::repeat(b' ').take(1 << 27)));
+        assert!(long.len() < 2_000_000);
+        assert!(matches!(Trace::read(&*long), Err(TraceError::TooLong)));
+        let deep = compressed(br#"{"options":{"a":"#.chain(io::repeat(b'[').take(10_000_000)));
+        assert!(matches!(Trace::read(&*deep), Err(TraceError::Format(_))));
+    }
 }

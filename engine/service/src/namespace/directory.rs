@@ -73,7 +73,8 @@ impl Namespace {
     /// The namespace with the root directory `root`, an absolute path of at most 41 bytes. The directory is created when it is
     /// first used.
     pub fn at(root: impl Into<PathBuf>) -> Self {
-        let root = root.into();
+        // A slash at the end would follow a symbolic link.
+        let root: PathBuf = root.into().components().collect();
         let prefix = format!("eg{:08x}", crc32fast::hash(root.as_os_str().as_bytes()));
         Namespace { root, prefix }
     }
@@ -105,6 +106,10 @@ impl Namespace {
             return Err(unusable(format!(
                 "it must have at most {MAX_ROOT} bytes, so that the paths of Unix sockets fit into 107 bytes, got {length}"
             )));
+        }
+        // iceoryx2 accepts no others.
+        if !self.root.as_os_str().as_bytes().iter().all(|byte| (b' '..=b'~').contains(byte)) {
+            return Err(unusable("it must consist of printable ASCII characters".to_owned()));
         }
         DirBuilder::new().recursive(true).mode(0o700).create(&self.root).map_err(|e| unusable(e.to_string()))?;
         let metadata = fs::symlink_metadata(&self.root).map_err(|e| unusable(e.to_string()))?;
@@ -181,6 +186,18 @@ mod tests {
         assert!(reason(&Namespace::at("somewhere")).contains("absolute"));
         assert!(reason(&Namespace::at(format!("/tmp/{}", "a".repeat(MAX_ROOT)))).contains("at most"));
         assert!(reason(&Namespace::at("/dev/null")).contains("/dev/null"));
+        let own = PathBuf::from(format!("/tmp/endless-own-{}", std::process::id()));
+        fs::create_dir(&own).unwrap();
+        fs::set_permissions(&own, fs::Permissions::from_mode(0o700)).unwrap();
+        std::os::unix::fs::symlink(&own, own.join("link")).unwrap();
+        for link in ["link", "link/", "./link//."] {
+            assert!(reason(&Namespace::at(own.join(link))).contains("must be a directory"), "{link}");
+        }
+        for name in ["\u{fc}", "\n", "a\u{7f}"] {
+            assert!(reason(&Namespace::at(own.join(name))).contains("ASCII"), "{name:?}");
+            assert!(!own.join(name).exists());
+        }
+        fs::remove_dir_all(&own).unwrap();
         let shared = reason(&Namespace::at("/tmp"));
         assert!(shared.contains("/tmp") && !shared.contains("chmod"), "{shared}");
         let open = PathBuf::from(format!("/tmp/endless-open-{}", std::process::id()));

@@ -59,8 +59,8 @@ impl Identity {
         let random = MAX_PREFIX - 1 - namespace.prefix().len();
         let random: String = rand::rng().sample_iter(Alphanumeric).take(random).map(char::from).collect();
         let prefix = format!("{}{random}_", namespace.prefix());
-        let mut file = File::options().write(true).create_new(true).mode(0o600).open(path)?;
-        file.write_all(prefix.as_bytes())?;
+        let mut file = File::options().write(true).create_new(true).mode(0o600).open(&path)?;
+        file.write_all(prefix.as_bytes()).inspect_err(|_| drop(fs::remove_file(&path)))?;
         Ok(Identity { root: namespace.root().to_owned(), prefix })
     }
 
