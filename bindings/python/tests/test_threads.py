@@ -68,7 +68,7 @@ def test_calls_of_other_threads_succeed_while_one_waits_for_a_stopped_engine() -
             lambda: envs.running_episodes(),
             lambda: (envs.send(ACTIONS, 0), envs.recv(0)),
         ]
-        (engine,) = psutil.Process().children()
+        engine = psutil.Process(envs._engine.pid)
         for call in calls:
             engine.suspend()
             envs.send(ACTIONS, 1)
