@@ -93,8 +93,8 @@ def train_rank(
     """The part of `train` that runs while the ranks are connected and the folder `run` is locked."""
     resumed: dict[str, Any] | None = None
     if has_begun:
-        resumed = checkpoint.load(run).resumable()
         check_resumable(settings, checkpoint.read_settings(run))
+        resumed = checkpoint.load(run).resumable()
         settings = dataclasses.replace(settings, resume="", run=str(run))
 
     torch.manual_seed(settings.seed)
