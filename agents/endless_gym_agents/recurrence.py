@@ -161,7 +161,7 @@ class PackedLSTM(torch.autograd.Function):
 
 
 def packed_layers(
-    x: Tensor, weights: Sequence[Sequence[Tensor]], hidden: Tensor, sizes: Sequence[int], native: bool
+    x: Tensor, weights: Sequence[Sequence[Tensor]], hidden: Tensor, sizes: Sequence[int], native: bool = False
 ) -> Tensor:
     """The outputs of the last of stacked GRU or LSTM layers, float (M, H), with gradients of inputs and weights.
 
