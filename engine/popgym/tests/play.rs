@@ -133,6 +133,7 @@ fn experts_reach_what_can_be_reached() {
         .map(|(squares, mines): (f64, f64)| 1.0 - mines / squares * (1.5 + 1.0 / (squares - mines)));
     let arms = [10.0, 20.0, 30.0].map(|arms: f64| (arms - 1.0) / (arms + 1.0));
     let pendulum = [0.915, 0.886, 0.83];
+    // More noise, not shorter episodes, makes it harder.
     let noisy_pendulum = [pendulum[0]; 3];
     // A family; for each difficulty, the least mean return, and that bound.
     for (family, least, bound) in [
