@@ -40,8 +40,9 @@ from endless_gym_agents import own, wrappers
 from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
 from endless_gym_agents.encoders import FRAME, Encoder, Observation, OwnEncoder, Shapes, orthogonal
 from endless_gym_agents.heads import Perceptron, PolicyHead, ReconstructionHead, ValueHead
+from endless_gym_agents.memories.sequence_model import SequenceModel
 from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
-from endless_gym_agents.recurrent import CellMemory, RecurrentMemory
+from endless_gym_agents.recurrent import CellMemory, RecurrentMemory, SequenceMemory
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.transformer import TransformerMemory
 from endless_gym_agents.transforms import FrameStack, Identity, ObservationTransform, PositionalEncoding, TransformState
@@ -194,9 +195,13 @@ class Agent(nn.Module):
             gating = settings.transformer.gating or settings.agent == "gtrxl"
             transformer = dataclasses.replace(settings.transformer, window=settings.window(), gating=gating)
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
-        elif settings.is_own_agent:
-            cell, options = own.load("--agent", settings.agent, nn.Module), settings.agent_options()
-            self.memory = CellMemory(cell, self.encoder.width, settings.recurrence, options, self.device)
+        elif settings.agent_class:
+            layer = own.load("--agent", settings.agent_class, nn.Module)
+            arguments = self.encoder.width, settings.recurrence, settings.agent_options(), self.device
+            if issubclass(layer, SequenceModel):
+                self.memory = SequenceMemory(layer, *arguments)
+            else:
+                self.memory = CellMemory(layer, *arguments)
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
         has_memory = not isinstance(self.memory, NoMemory)

@@ -198,7 +198,7 @@ def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Se
     for layers in (settings.recurrence.layers, settings.transformer.layers):
         if layers > max(len(weights), Transformer.layers):
             raise ValueError(f"{layers} layers need more weights than the checkpoint's {len(weights)}")
-    if not (settings.is_own_agent or settings.encoder):
+    if not (":" in settings.agent or settings.encoder):
         # Without memory for the weights, whose sizes the settings may exaggerate.
         with torch.device("meta"):
             expected = make_agent(settings, spec(settings.env), "meta").state_dict()

@@ -91,7 +91,7 @@ class KernelMinGRU(torch.autograd.Function):
     """A minGRU layer (Feng et al., 2024): z = sigmoid(x_z), h = (1 - z) h' + z x_h, with projected inputs x and state h'."""
 
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, hidden: Tensor, sizes: Sequence[int]) -> Tensor:
+    def forward(ctx: Any, inputs: Tensor, hidden: Tensor, sizes: Sequence[int], resets: Sequence[bool] = ()) -> Tensor:
         """The hidden states after all steps, float32 (M, H).
 
         Args:
@@ -99,12 +99,13 @@ class KernelMinGRU(torch.autograd.Function):
             inputs: Projected inputs x_z and x_h, float32 (M, 2 * H).
             hidden: Hidden states before the first steps, float32 (S, H).
             sizes: Number of sequences that have each step.
+            resets: Whether the state before each step is 0, (M,); empty if there are no such steps.
         """
         rows, width = len(inputs), hidden.shape[1]
         saved, outputs = inputs.new_empty(rows, 2 * width), inputs.new_empty(rows, width)
-        _native.mingru_forward(_array(inputs), _array(hidden), sizes, (), _array(saved), _array(outputs))
+        _native.mingru_forward(_array(inputs), _array(hidden), sizes, resets, _array(saved), _array(outputs))
         ctx.save_for_backward(inputs, saved)
-        ctx.sizes = sizes
+        ctx.sizes, ctx.resets = sizes, resets
         return outputs
 
     @staticmethod
@@ -114,5 +115,5 @@ class KernelMinGRU(torch.autograd.Function):
         inputs, saved = ctx.saved_tensors
         grad_inputs, hidden = grad.new_empty(inputs.shape), grad.new_empty(ctx.sizes[0], grad.shape[1])
         arrays = _array(inputs), _array(saved), _array(grad)
-        _native.mingru_backward(*arrays, ctx.sizes, (), _array(grad_inputs), _array(hidden))
-        return grad_inputs, hidden, None
+        _native.mingru_backward(*arrays, ctx.sizes, ctx.resets, _array(grad_inputs), _array(hidden))
+        return grad_inputs, hidden, None, None

@@ -1,14 +1,15 @@
-"""Recurrent memory: GRU and LSTM, trained with truncated backpropagation through time.
+"""Recurrent memories: GRU, LSTM, and the classes of other layers, trained with truncated backpropagation through time.
 
-For learning, a segment is cut into sequences at the start of each episode and after every `sequence_length` steps. A sequence
-starts from the hidden state that was stored while acting (there is no burn-in), and gradients stop at its start. Sequences are
-packed (`PackedSequence`): there is no padding, and the number of sequential steps is the length of the longest sequence. Learning
-uses the layers of `recurrence` on the CPU, and PyTorch's elsewhere.
+For learning, a segment is cut into sequences after every `sequence_length` steps, and, except for sequence models, at the start
+of each episode. A sequence starts from the hidden state that was stored while acting (there is no burn-in), and gradients stop
+at its start. Sequences are packed (`PackedSequence`): there is no padding, and the number of sequential steps is the length of
+the longest sequence. Learning uses the layers of `recurrence` on the CPU, and PyTorch's elsewhere.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,7 @@ from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym_agents.encoders import orthogonal
 from endless_gym_agents.kernels import kernels_are_faster
+from endless_gym_agents.memories.sequence_model import SequenceModel, Stack, State, restarted
 from endless_gym_agents.memory import Memory, MemoryState, Minibatch, Minibatches, is_own, shuffled
 from endless_gym_agents.recurrence import packed_layers
 from endless_gym_agents.settings import Recurrence
@@ -54,10 +56,12 @@ class RecurrentMinibatch(Minibatch):
     Attributes:
         batch_sizes: Number of sequences that have a step t, int64 (longest,), on the CPU; as in `PackedSequence`.
         initial_hidden: States before the first steps of the sequences, float32 (parts, layers, sequences, hidden size).
+        resets: Whether each of the M steps is the first of an episode, bool (M,), on the CPU.
     """
 
     batch_sizes: Tensor
     initial_hidden: Tensor
+    resets: Tensor
 
 
 class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
@@ -65,6 +69,9 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
 
     The update that `step` returns is the next hidden state, float (parts, layers, n, hidden size).
     """
+
+    #: Whether a sequence ends with its episode.
+    cut_at_episodes = True
 
     def __init__(self, kind: str, input_width: int, settings: Recurrence, device: torch.device) -> None:
         """Make the layers with orthogonal weights and zero biases.
@@ -152,7 +159,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
             [torch.cat([state.stored[cut] for state in states], dim=2) for cut in range(-(-steps // length))]
         )  # (cuts, parts, layers, own environments, hidden size)
         # A sequence starts every `length` steps and with each episode. Sequences are ordered by environment, then by step.
-        starts = reset_mask.t().clone()
+        starts = reset_mask.t() & self.cut_at_episodes
         starts[:, ::length] = True
         env, time = starts.nonzero(as_tuple=True)
         start = env * steps + time
@@ -167,12 +174,13 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
             e, t, sizes = env[chosen], time[chosen], lengths[chosen]
             n = e - own.start if own.start else e
             indices, batch_sizes = packed(t, n, sizes, len(own))
+            resets = reset_mask[:, own.start : own.stop].flatten()[indices]
             indices = indices.to(self.device)
             hidden = stored[(t // length).to(stored.device), :, :, n.to(stored.device)]
             starts_episode = reset_mask[t, e].to(stored.device)[:, None]
             hidden = hidden.permute(1, 2, 0, 3).masked_fill(starts_episode, 0.0).contiguous()
             everywhere = indices if everywhere is None else everywhere
-            return RecurrentMinibatch(indices, everywhere, batch_sizes, hidden)
+            return RecurrentMinibatch(indices, everywhere, batch_sizes, hidden, resets)
 
         return Minibatches(shuffled(lengths.tolist(), num_minibatches, epochs, generator), minibatch)
 
@@ -240,9 +248,7 @@ class CellMemory(RecurrentMemory):
                 settings.hidden_size if settings.embedding else input_width, settings.hidden_size, **options
             )
         except TypeError as error:
-            raise ValueError(
-                f"{make.__name__} cannot be made of an input width, a hidden size and --agent-option: {error}"
-            ) from error
+            raise _not_made(make, error) from error
         self.width = int(getattr(self.cell, "width", settings.hidden_size))
         self._state_width = int(getattr(self.cell, "state_width", settings.hidden_size))
 
@@ -268,6 +274,74 @@ class CellMemory(RecurrentMemory):
                 y, hidden = self.cell(step, hidden[: len(step)])
                 outputs.append(y)
         return torch.cat(outputs)
+
+
+class SequenceMemory(RecurrentMemory):
+    """A recurrent memory of stacked layers of a class derived from `SequenceModel`: one of `memories`, or one of your own.
+
+    The state of a layer, a tree of tensors, is stored as the entries of one vector of an environment.
+    """
+
+    cut_at_episodes = False
+
+    def __init__(
+        self,
+        make: type[SequenceModel],
+        input_width: int,
+        settings: Recurrence,
+        options: dict[str, Any],
+        device: torch.device,
+    ) -> None:
+        """Make the layers; arguments and errors as for `CellMemory`, which has no number of layers."""
+        nn.Module.__init__(self)
+        if settings.residual:
+            raise ValueError(
+                "--recurrence.residual is for the agents gru and lstm; other layers determine it themselves"
+            )
+        self.settings, self.device, self.parts = settings, device, 1
+        self.embedding = _embedding(input_width, settings)
+        inputs = settings.hidden_size if settings.embedding else input_width
+        try:
+            self.cell = Stack(make, inputs, settings.hidden_size, settings.layers, options)
+        except TypeError as error:
+            raise _not_made(make, error) from error
+        self.width = self.cell.width
+        for layer in self.cell.layers:
+            layer.native = settings.kernels == "auto"
+        self._sizes = [math.prod(shape) for shape in self.cell.state_shapes.values()]
+
+    def initial_state(self, num_envs: int) -> RecurrentState:
+        return RecurrentState(torch.zeros((1, 1, num_envs, sum(self._sizes)), device=self.device))
+
+    def refresh(self, dtype: torch.dtype) -> None:
+        pass
+
+    def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        tree = self._tree(state.hidden[0, 0])
+        with self._float32():
+            y, after = self.cell.step(x.float(), tree if reset_mask is None else restarted(tree, reset_mask))
+        vectors = [after[name].flatten(1) for name in self.cell.state_shapes]
+        return y, torch.cat(vectors, dim=1)[None, None]
+
+    def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
+        sizes = minibatch.batch_sizes
+        # Shorter sequences are padded at their end with other steps, whose outputs are not used.
+        exists = torch.arange(int(sizes[0])) < sizes.unsqueeze(1)
+        rows = exists.flatten().cumsum(0) - 1
+        resets = minibatch.resets[rows].view_as(exists).to(x.device)
+        padded = x.float().index_select(0, rows.to(x.device)).unflatten(0, exists.shape)
+        with self._float32():
+            y, _ = self.cell.sequence(padded, self._tree(minibatch.initial_hidden[0, 0]), resets)
+        return y.flatten(0, 1).index_select(0, exists.flatten().nonzero()[:, 0].to(x.device))
+
+    def _tree(self, vectors: Tensor) -> State:
+        """The states in vectors (n, entries), as views."""
+        parts = zip(self.cell.state_shapes.items(), vectors.split(self._sizes, dim=1), strict=True)
+        return {name: part.unflatten(1, shape) for (name, shape), part in parts}
+
+
+def _not_made(make: type[nn.Module], error: TypeError) -> ValueError:
+    return ValueError(f"{make.__name__} cannot be made of an input width, a hidden size and --agent-option: {error}")
 
 
 def _embedding(input_width: int, settings: Recurrence) -> nn.Sequential | None:

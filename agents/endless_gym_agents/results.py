@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from endless_gym_agents import metrics
+from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.settings import Recurrence, Settings
 from endless_gym_agents.statistics import Summary, summarise
 
@@ -94,7 +95,7 @@ def label(settings: Settings) -> str:
     name += "".join(f"_{option}" for option in settings.agent_option)
     if settings.agent == "gtrxl":
         name += f"_b{settings.transformer.gate_bias:g}"
-    if settings.agent in ("gru", "lstm") and settings.recurrence.hidden_size != Recurrence().hidden_size:
+    if settings.agent in ("gru", "lstm", *MEMORIES) and settings.recurrence.hidden_size != Recurrence().hidden_size:
         name += f"_{settings.recurrence.hidden_size}"
     encoder = (settings.encoder.rpartition(":")[2], *settings.encoder_option) if settings.encoder else ()
     wrappers = (wrapper.rpartition(":")[2] for wrapper in settings.environment.wrapper)

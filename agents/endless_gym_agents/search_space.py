@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.settings import Settings, value
 
 #: A value of a parameter.
@@ -59,6 +60,8 @@ def space(base: Settings, only: Sequence[str] = ()) -> Space:
         choices |= _RECONSTRUCTION
     if base.agent in ("gru", "lstm"):
         choices |= _RECURRENCE
+    elif base.agent in MEMORIES:
+        choices |= {name: _RECURRENCE[name] for name in ("recurrence.layers", "recurrence.hidden_size")}
     elif base.agent in ("trxl", "gtrxl"):
         choices |= _TRANSFORMER
     names = [name.replace("-", "_") for name in only]

@@ -18,11 +18,12 @@ from torch import nn
 
 from endless_gym.specs import DEFAULT_ENV_ID, spec
 from endless_gym_agents import own, ranges
+from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.metrics import is_finite
 from endless_gym_agents.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
 
 #: The agents of the package. Others are classes of your own; see `Settings.agent`.
-AGENTS = ("gru", "lstm", "trxl", "gtrxl", "none", "stack", "position")
+AGENTS = ("gru", "lstm", *MEMORIES, "trxl", "gtrxl", "none", "stack", "position")
 PresetName = Literal["paper", "old", "overnight", "throughput", "throughput-512", "quick"]
 
 #: Seeds of the training episodes. Evaluation uses seeds from 200,000 on, so its levels are never seen in training.
@@ -73,7 +74,7 @@ class Environment:
 
 @dataclass(frozen=True)
 class Recurrence:
-    """Memory of the agents gru and lstm."""
+    """Memory of all agents but the transformers and the baselines."""
 
     hidden_size: Positive = 512
     """size of the hidden state"""
@@ -193,11 +194,12 @@ class Settings:
     env: str = DEFAULT_ENV_ID
     """environment id; `endless list` lists them"""
     agent: str = "gru"
-    """gru, lstm, trxl (Transformer-XL) or gtrxl (gated Transformer-XL); a baseline without memory: none, stack (stacked grey
-    frames) or position (encoded step number as an observation); or a memory of your own: module:Class or file.py:Class, a class
-    as `endless_gym_agents.recurrent.CellMemory` describes"""
+    """gru, lstm, trxl (Transformer-XL), gtrxl (gated Transformer-XL) or mingru; a baseline without memory: none, stack (stacked
+    grey frames) or position (encoded step number as an observation); or a memory of your own: module:Class or file.py:Class, a
+    class derived from `endless_gym_agents.memories.sequence_model.SequenceModel`, or one as
+    `endless_gym_agents.recurrent.CellMemory` describes"""
     agent_option: tuple[str, ...] = ()
-    """arguments of the class of an agent of your own, each as NAME=VALUE with a JSON value"""
+    """arguments of the agent's class, each as NAME=VALUE with a JSON value; not for gru, lstm, trxl, gtrxl and the baselines"""
     encoder: str = ""
     """encoder of your own: module:Class or file.py:Class, a class as `endless_gym_agents.encoders.OwnEncoder` describes; empty
     for the paper's convolutional network"""
@@ -283,9 +285,9 @@ class Settings:
         return _named_values("--encoder-option", self.encoder_option, "'width=256'")
 
     @property
-    def is_own_agent(self) -> bool:
-        """Whether the agent is a class outside this package."""
-        return ":" in self.agent
+    def agent_class(self) -> str:
+        """The agent's class as module:Class or file.py:Class; empty for those of the package that are not recurrent layers."""
+        return self.agent if ":" in self.agent else MEMORIES.get(self.agent, "")
 
     @property
     def agent_name(self) -> str:
@@ -301,16 +303,17 @@ class Settings:
         ranges.check(self)
         env_spec = spec(self.env)
         env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
-        if self.is_own_agent:
-            own.load("--agent", self.agent, nn.Module)
+        if self.agent_class:
+            own.load("--agent", self.agent_class, nn.Module)
         elif self.agent not in AGENTS:
             near = difflib.get_close_matches(self.agent, AGENTS, 1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise ValueError(
                 f"--agent must be one of {', '.join(AGENTS)}, or module:Class or file.py:Class, got `{self.agent}`{hint}"
             )
-        if self.agent_options() and not self.is_own_agent:
-            raise ValueError(f"--agent-option needs an agent of your own, got --agent {self.agent}")
+        if self.agent_options() and not self.agent_class:
+            classes = ", ".join(MEMORIES)
+            raise ValueError(f"--agent-option is for {classes} and agents of your own, got --agent {self.agent}")
         if self.encoder:
             own.load("--encoder", self.encoder, nn.Module)
         elif self.encoder_options():

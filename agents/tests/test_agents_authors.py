@@ -92,7 +92,9 @@ def test_recurrent_layers_equal_those_of_the_authors(name: str) -> None:
     # Packed: step by step.
     order = torch.arange(len(x)).view(sequences, length).t().flatten()
     batch_sizes = torch.full((length,), sequences)
-    output = memory(memory.embed(x[order]), RecurrentMinibatch(order, order, batch_sizes, hidden.contiguous()))
+    output = memory(
+        memory.embed(x[order]), RecurrentMinibatch(order, order, batch_sizes, hidden.contiguous(), order < 0)
+    )
     assert_close(output, tensors(recorded["output"])[order])
     assert_gradients(memory, output, factor[order], recorded)
 

@@ -20,6 +20,7 @@ HEADS = "--environment.observation rgb --ppo.reconstruction-coefficient 0.1 --pp
 FLAGS = {
     "gru": f"--env Endless-MortarMayhem-v0 --agent gru {HEADS}",
     "lstm": "--env MortarMayhemB-Grid-v0 --agent lstm --recurrence.layers 2 --ppo.advantage-normalisation minibatch",
+    "mingru": "--env MortarMayhemB-Grid-v0 --agent mingru --recurrence.layers 2 --recurrence.kernels torch",
     "trxl": "--env Endless-MysteryPath-v0 --agent trxl --transformer.positional-encoding learned --transformer.query-encoding",
     "gtrxl": "--env MortarMayhemB-Grid-v0 --agent gtrxl --transformer.positional-encoding relative --transformer.query-previous",
     "stack": "--env MortarMayhemB-Grid-v0 --agent stack --environment.observation rgb --model.stack 2",

@@ -22,6 +22,9 @@ KINDS = {
     "gru, two layers, residual": ("gru", {"recurrence": Recurrence(16, layers=2, residual=True, sequence_length=5)}),
     "lstm": ("lstm", {}),
     "lstm without embedding": ("lstm", {"recurrence": Recurrence(16, embedding=False, sequence_length=24)}),
+    "mingru": ("mingru", {}),
+    "mingru, two layers, uneven sequences": ("mingru", {"recurrence": Recurrence(16, layers=2, sequence_length=7)}),
+    "mingru, PyTorch's operations": ("mingru", {"recurrence": Recurrence(16, sequence_length=8, kernels="torch")}),
     "trxl": ("trxl", {}),
     "trxl, full heads": ("trxl", transformer(shared_heads=False)),
     "trxl, learned": ("trxl", transformer(positional_encoding="learned", query_encoding=True)),
@@ -331,6 +334,8 @@ def test_the_setting_selects_the_native_kernels(kind: str, monkeypatch: pytest.M
     for kernels in ("auto", "torch"):
         memory = RecurrentMemory(kind, 16, Recurrence(16, kernels=kernels), torch.device("cpu"))
         hidden = torch.zeros(memory.parts, 1, 2, 16)
-        output = memory(torch.randn(3, 16), RecurrentMinibatch(indices, indices, sizes, hidden))
+        output = memory(
+            torch.randn(3, 16), RecurrentMinibatch(indices, indices, sizes, hidden, torch.zeros(3, dtype=torch.bool))
+        )
         names.append(type(output.grad_fn).__name__)
     assert names == [f"Kernel{kind.upper()}Backward", f"Packed{kind.upper()}Backward"]

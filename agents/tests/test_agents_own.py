@@ -270,7 +270,7 @@ def test_encoders_and_wrappers_that_do_not_fit_are_refused(
         ("os:system", (), "--agent must name a class derived from Module, got `os:system`"),
         ("min_gru.py:MinGRU", ("depth=2",), "MinGRU cannot be made of .* 'depth'"),
         ("min_gru.py:MinGRU", ("layers",), "--agent-option must be NAME=VALUE with a JSON value"),
-        ("gru", ("layers=2",), "--agent-option needs an agent of your own, got --agent gru"),
+        ("gru", ("layers=2",), "--agent-option is for mingru.* and agents of your own, got --agent gru"),
     ],
 )
 def test_agents_that_cannot_be_made_are_refused(agent: str, option: tuple[str, ...], message: str, file: Path) -> None:

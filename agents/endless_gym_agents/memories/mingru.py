@@ -1,0 +1,49 @@
+"""minGRU: a GRU whose gate and candidate depend on the input only, so that its state is a linear recurrence.
+
+Feng et al., "Were RNNs All We Needed?", 2024 (https://arxiv.org/abs/2410.01201), section 3.1:
+
+    z_t = sigmoid(W_z x_t + b_z)            update gate
+    h~_t = W_h x_t + b_h                    candidate
+    h_t = (1 - z_t) h_{t-1} + z_t h~_t      state and output, (B, width)
+
+This is the form of the paper's section 3; its appendix computes the same in log space with a positive candidate, which a scan
+without products of small numbers does not need.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from endless_gym_agents.kernels import KernelMinGRU, kernels_are_faster
+from endless_gym_agents.memories.scans import linear_scan
+from endless_gym_agents.memories.sequence_model import SequenceModel, State
+
+
+class MinGRU(SequenceModel):
+    """The state is h, float32 (B, width). `projection` has the rows of W_z, then those of W_h."""
+
+    def __init__(self, input_width: int, width: int) -> None:
+        """Make the layer with orthogonal weights and zero biases."""
+        super().__init__()
+        self.width, self.state_shapes = width, {"h": (width,)}
+        self.projection = nn.Linear(input_width, 2 * width)
+        for part in self.projection.weight.data.chunk(2):
+            nn.init.orthogonal_(part)
+        nn.init.zeros_(self.projection.bias)
+
+    def step(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        z, candidate = self.projection(x).chunk(2, dim=-1)
+        h = torch.lerp(state["h"], candidate, z.sigmoid())
+        return h, {"h": h}
+
+    def sequence(self, x: Tensor, state: State, resets: Tensor) -> tuple[Tensor, State]:
+        projected = self.projection(x)
+        if self.native and x.device.type == "cpu" and kernels_are_faster(self.width):
+            flat, sizes = projected.flatten(0, 1), [x.shape[1]] * len(x)
+            h = KernelMinGRU.apply(flat, state["h"], sizes, resets.flatten().tolist()).view(*resets.shape, -1)
+        else:
+            z, candidate = projected.chunk(2, dim=-1)
+            z = z.sigmoid()
+            h = linear_scan(1 - z, z * candidate, state["h"], resets)
+        return h, {"h": h[-1]}
