@@ -103,7 +103,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
                 nn.init.orthogonal_(parameter, 2**0.5)
             else:
                 nn.init.zeros_(parameter)
-        self._cells: list[list[Tensor]] = []
+        self._cells: Sequence[Sequence[Tensor]] = []
 
     def initial_state(self, num_envs: int) -> RecurrentState:
         shape = (self.parts, self.settings.layers, num_envs, self.width)
@@ -114,7 +114,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
 
     def refresh(self, dtype: torch.dtype) -> None:
         # The recurrent layers compute in float32, whatever `dtype` is.
-        self._cells = [[weight.detach() for weight in layer] for layer in self.recurrent.all_weights]
+        self._cells = self.recurrent.all_weights
 
     def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor | None) -> tuple[Tensor, Tensor]:
         hidden = state.hidden

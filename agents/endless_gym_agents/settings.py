@@ -194,10 +194,11 @@ class Settings:
     env: str = DEFAULT_ENV_ID
     """environment id; `endless list` lists them"""
     agent: str = "gru"
-    """gru, lstm, trxl (Transformer-XL), gtrxl (gated Transformer-XL) or mingru; a baseline without memory: none, stack (stacked
-    grey frames) or position (encoded step number as an observation); or a memory of your own: module:Class or file.py:Class, a
-    class derived from `endless_gym_agents.memories.sequence_model.SequenceModel`, or one as
-    `endless_gym_agents.recurrent.CellMemory` describes"""
+    """gru, lstm, mingru, lru, mamba2, gated-deltanet, retnet, mlstm, ffm (Fast and Forgetful Memory), shm (Stable Hadamard
+    Memory), trxl (Transformer-XL) or gtrxl (gated Transformer-XL); a baseline without memory: none, stack (stacked grey frames)
+    or position (encoded step number as an observation); or a memory of your own: module:Class or file.py:Class, a class derived
+    from `endless_gym_agents.memories.sequence_model.SequenceModel`, or one as `endless_gym_agents.recurrent.CellMemory`
+    describes"""
     agent_option: tuple[str, ...] = ()
     """arguments of the agent's class, each as NAME=VALUE with a JSON value; not for gru, lstm, trxl, gtrxl and the baselines"""
     encoder: str = ""

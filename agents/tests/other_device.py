@@ -123,6 +123,8 @@ REPLACED = {
     "_thnn_fused_gru_cell_backward": gru_cell_backward,
     "_thnn_fused_lstm_cell": lstm_cell,
     "_thnn_fused_lstm_cell_backward_impl": lstm_cell_backward,
+    # A wrapper does not know that its tensor is a conjugate view.
+    "_conj": torch.conj_physical,
     # Use the unfused attention.
     "_fused_sdp_choice": lambda *args, **kwargs: 0,
 }

@@ -86,7 +86,7 @@ class Stack(SequenceModel):
             input_width = self.layers[-1].width
         self.width = input_width
         norms = layers + 1 if make.residual else 0
-        self.norms: list[nn.Module] = nn.ModuleList(nn.RMSNorm(self.width) for _ in range(norms))  # type: ignore[assignment]
+        self.norms: list[nn.Module] = nn.ModuleList(nn.RMSNorm(self.width, eps=1e-5) for _ in range(norms))  # type: ignore[assignment]
         self.state_shapes = {
             f"{number}.{name}": shape
             for number, layer in enumerate(self.layers)

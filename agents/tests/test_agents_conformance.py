@@ -1,0 +1,147 @@
+"""The checks of a memory: all memories of the package pass them, and memories with mistakes do not."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from endless_gym_agents import conformance
+from endless_gym_agents.memories import MEMORIES
+
+
+@pytest.mark.parametrize("name", ["gru", "lstm", "trxl", "gtrxl", *MEMORIES])
+def test_the_memories_of_the_package_pass(name: str) -> None:
+    # The cache of a transformer is as long as its window, so fewer steps suffice.
+    results = list(
+        conformance.check(name, steps=500 if "trxl" in name else 1000, long=500 if "trxl" in name else 10_000)
+    )
+    assert [result.name for result in results if not result.passed] == []
+    names = {result.name for result in results}
+    assert names >= {"agreement", "reset", "size", "leak", "finite"}
+    assert ("gradient" in names) == ("trxl" not in name)
+
+
+MISTAKES = '''
+import torch
+from endless_gym_agents.memories.scans import linear_scan
+from endless_gym_agents.memories.sequence_model import SequenceModel
+
+
+class Right(SequenceModel):
+    """A running mean with the rate 0.1."""
+
+    def __init__(self, input_width, width):
+        super().__init__()
+        self.width, self.state_shapes = width, {"h": (width,)}
+        self.projection = torch.nn.Linear(input_width, width)
+
+    def step(self, x, state):
+        h = 0.9 * state["h"] + 0.1 * self.projection(x)
+        return h, {"h": h}
+
+    def sequence(self, x, state, resets):
+        y = linear_scan(torch.tensor(0.9), 0.1 * self.projection(x), state["h"], resets)
+        return y, {"h": y[-1]}
+
+
+class IgnoresResets(Right):
+    def sequence(self, x, state, resets):
+        return super().sequence(x, state, torch.zeros_like(resets))
+
+
+class SeesTheFuture(Right):
+    def sequence(self, x, state, resets):
+        return super().sequence(x + 1e-7 * x.roll(-1, 0), state, resets)
+
+
+class CutsGradients(Right):
+    def sequence(self, x, state, resets):
+        y, state = super().sequence(x, state, resets)
+        return y.detach() + 0.1 * (self.projection(x) - self.projection(x).detach()), state
+
+
+class Rounds(Right):
+    def sequence(self, x, state, resets):
+        y, state = super().sequence(x, state, resets)
+        return y + 2e-5, state
+
+
+class Overflows(Right):
+    def step(self, x, state):
+        h = 1.1 * state["h"] + self.projection(x)
+        return h, {"h": h}
+
+    sequence = SequenceModel.sequence
+
+
+class Vanishes(Right):
+    def step(self, x, state):
+        y = self.projection(x) * (state["h"] < 300)
+        return y, {"h": state["h"] + 1}
+
+    sequence = SequenceModel.sequence
+
+
+class Global(Right):
+    """Its steps share a state that no reset clears."""
+
+    count = 0.0
+
+    def step(self, x, state):
+        self.count += 0.001
+        y, state = super().step(x, state)
+        return y + self.count, state
+
+
+class Plain(torch.nn.Module):
+    """A cell as `CellMemory` takes it."""
+
+    def __init__(self, input_width, width):
+        super().__init__()
+        self.cell = torch.nn.GRUCell(input_width, width)
+
+    def forward(self, x, state):
+        state = self.cell(x, state)
+        return state, state
+'''
+
+
+@pytest.mark.parametrize(
+    ("name", "failed"),
+    [
+        ("Right", set()),
+        ("Plain", set()),
+        ("IgnoresResets", {"agreement", "gradient", "leak"}),
+        ("SeesTheFuture", {"leak"}),
+        ("CutsGradients", {"gradient", "memory"}),
+        ("Rounds", {"agreement"}),
+        ("Overflows", {"finite"}),
+        ("Vanishes", {"finite"}),
+        ("Global", {"agreement", "reset"}),
+    ],
+)
+def test_a_mistake_is_found(name: str, failed: set[str], tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(MISTAKES)
+    results = conformance.check(f"{tmp_path}/own.py:{name}", steps=200, long=1000)
+    assert {result.name for result in results if not result.passed} >= failed
+    if not failed:
+        assert all(result.passed for result in conformance.check(f"{tmp_path}/own.py:{name}", steps=200, long=1000))
+
+
+def test_the_program_prints_the_checks_and_fails_if_one_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.py").write_text(MISTAKES)
+    monkeypatch.chdir(tmp_path)
+    for name, status in (("Right", 0), ("Rounds", 1)):
+        given = ["conformance", f"own.py:{name}", "--steps", "100", "--long-steps", "200"]
+        monkeypatch.setattr(sys, "argv", given)
+        assert conformance.main() == status
+        printed = capsys.readouterr()
+        assert ("FAILED  agreement" in printed.out) == bool(status)
+    assert "own.py:Rounds fails agreement" in printed.err
+
+
+def test_an_agent_without_memory_is_refused() -> None:
+    with pytest.raises(ValueError, match="agent `none` has no memory to check"):
+        list(conformance.check("none"))
