@@ -1,6 +1,9 @@
 //! `endless view`: what a browser receives from a running engine, and which requests are refused.
 
+use std::fs;
 use std::io::{BufRead, BufReader, Read};
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
@@ -213,9 +216,15 @@ fn the_page_is_opened_in_a_browser() {
         let mut command = place.endless(&["view", "--open"]);
         command.env("PATH", &path).env_remove("BROWSER").envs(variable.as_ref().map(|value| ("BROWSER", value)));
         let mut server = Server::start(command);
-        assert_eq!(given(program), arguments.replace("URL", &server.url), "{variable:?}");
+        let given = given(program);
+        let page = given.split("file://").nth(1).and_then(|rest| rest.split(' ').next()).unwrap_or(&given).to_owned();
+        assert_eq!(given, arguments.replace("URL", &format!("file://{page}")), "{variable:?}");
+        assert!(!given.contains(server.token()), "all users can read the arguments");
+        assert!(fs::read_to_string(&page).unwrap().contains(&format!("url={}\"", server.url)));
+        assert_eq!(fs::metadata(&page).unwrap().permissions().mode() & 0o777, 0o600);
         server.process.interrupt();
         assert_eq!(server.process.errors(), "", "{variable:?}");
+        assert!(!Path::new(&page).exists());
     }
 }
 

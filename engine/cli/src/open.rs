@@ -1,7 +1,11 @@
 //! Opens a page in the user's browser.
 
 use std::ffi::OsString;
-use std::io;
+use std::fs::{self, OpenOptions};
+use std::hash::{BuildHasher, RandomState};
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::thread;
 
@@ -12,6 +16,34 @@ const BROWSER: &str = "BROWSER";
 
 /// The program that opens an address in the desktop's default browser.
 const DESKTOP: &str = "xdg-open";
+
+/// A page that leads to an address, in a file that only this user can read. Dropping it removes the file.
+#[derive(Debug)]
+pub struct PrivatePage(PathBuf);
+
+impl PrivatePage {
+    /// Opens an address that contains a secret. All users can read a browser's arguments in the list of processes, so the browser
+    /// is given the name of the page.
+    pub fn open(url: &str) -> io::Result<Self> {
+        let folder = std::env::var_os("XDG_RUNTIME_DIR").map_or_else(std::env::temp_dir, PathBuf::from);
+        // With a name that others cannot foresee, they cannot make a file of this name first.
+        let page = PrivatePage(folder.join(format!("endless-{:016x}.html", RandomState::new().hash_one(url))));
+        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&page.0)?;
+        let url = url.replace('&', "&amp;");
+        write!(
+            file,
+            "<!doctype html><meta http-equiv=\"refresh\" content=\"0;url={url}\"><a href=\"{url}\">The page</a>\n"
+        )?;
+        in_browser(&format!("file://{}", page.0.display()));
+        Ok(page)
+    }
+}
+
+impl Drop for PrivatePage {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
 
 /// Opens an address in a browser without waiting for it. A failure is only printed, since the page is served anyway.
 pub fn in_browser(url: &str) {

@@ -8,7 +8,7 @@ use endless_gym_service::Namespace;
 use endless_gym_view::ViewServer;
 
 use super::failure::Failure;
-use super::open;
+use super::open::PrivatePage;
 use super::output::{print, print_error};
 use super::{stop, terminal, watch};
 
@@ -51,34 +51,33 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if let Some(parent) = args.child {
         stop::with_parent(stop, parent);
     }
-    let server = announce(args.service.as_deref(), args.page.port, args.page.open)?;
+    let (server, _page) = announce(args.service.as_deref(), args.page.port, args.page.open)?;
     if args.child.is_none() {
         print("stop with Ctrl-C")?;
     }
     Ok(server.run(stop)?)
 }
 
-/// Binds the port and prints the address.
-fn announce(service: Option<&str>, port: u16, open: bool) -> Result<ViewServer, Failure> {
+/// Binds the port, prints the address, which contains the token, and opens it if wished.
+fn announce(service: Option<&str>, port: u16, open: bool) -> Result<(ViewServer, Option<PrivatePage>), Failure> {
     let server = ViewServer::bind(port, Namespace::default(), service)?;
     let url = server.url();
     print(format_args!("view {} at {url}", service.unwrap_or("the running engines")))?;
-    if open {
-        open::in_browser(&url);
-    }
-    Ok(server)
+    let page = open.then(|| PrivatePage::open(&url)).transpose()?;
+    Ok((server, page))
 }
 
 /// A page served in a background thread, until this is dropped.
 pub struct Beside {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
+    _page: Option<PrivatePage>,
 }
 
 impl Beside {
     /// Shows an engine on any free port, and prints the address.
     pub fn start(service: &str, open: bool) -> Result<Self, Failure> {
-        let server = announce(Some(service), 0, open)?;
+        let (server, page) = announce(Some(service), 0, open)?;
         let stop = Arc::new(AtomicBool::new(false));
         let flag = Arc::clone(&stop);
         let serve = move || {
@@ -87,7 +86,7 @@ impl Beside {
             }
         };
         let thread = thread::Builder::new().name("view".to_owned()).spawn(serve)?;
-        Ok(Beside { stop, thread: Some(thread) })
+        Ok(Beside { stop, thread: Some(thread), _page: page })
     }
 }
 
