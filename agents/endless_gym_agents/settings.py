@@ -101,7 +101,7 @@ class Transformer:
     """embedding dimension of the blocks"""
     heads: Positive = 4
     """attention heads per block"""
-    window: Natural = 0
+    window: Annotated[int, Range(0, 2**16)] = 0
     """length of the sliding attention window: the current step and the past steps that it can attend to; 0 for the length of the
     longest episode, or 256 in endless environments, as in the paper"""
     positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"

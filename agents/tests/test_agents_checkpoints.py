@@ -103,6 +103,7 @@ def test_the_message_names_what_is_wrong(file: Path, tmp_path: Path) -> None:
     [
         {"recurrence": {"layers": 10**9}},
         {"transformer": {"layers": 10**9}},
+        {"transformer": {"window": 10**9}},
         {"recurrence": {"hidden_size": 10**6}},
         {"model": {"head_width": 10**7}},
         {"model": {"body_width": 10**12}},
