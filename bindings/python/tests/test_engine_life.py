@@ -57,6 +57,38 @@ def test_an_engine_ends_with_the_wrappers_around_it(no_collector: None) -> None:
     assert endless_gym.running_engines() == []
 
 
+def resources() -> dict[str, object]:
+    """What this process and the engines hold: descriptors, threads, child processes, shared memory and other files."""
+    root = Path(os.environ.get("ENDLESS_GYM_ROOT", f"/tmp/endless-gym-{os.getuid()}"))
+    process = Path("/proc/self")
+    return {
+        "descriptors": len(os.listdir(process / "fd")),
+        "threads": len(os.listdir(process / "task")),
+        "children": (process / f"task/{os.getpid()}/children").read_text(),
+        "segments": segments(),
+        "files": len(list(root.rglob("*"))),
+    }
+
+
+def memory() -> int:
+    """Resident memory of this process in kilobytes."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmRSS:")[1].split()[0])
+
+
+def test_starts_and_stops_of_engine_trainer_and_observer_leave_nothing() -> None:
+    """`ENDLESS_STARTS` is their number."""
+    starts = int(os.environ.get("ENDLESS_STARTS", "30"))
+    for number in range(starts):
+        with endless_gym.serve(ID, 4) as envs, endless_gym.watch(envs._engine.service) as batches:
+            play(envs)
+            next(batches)
+        if number == starts // 3:
+            before, kilobytes = resources(), memory()
+    assert resources() == before
+    assert memory() - kilobytes < 2_000 + 2 * starts
+
+
 def test_an_engine_ends_when_an_exception_leaves_its_function(no_collector: None) -> None:
     def fails() -> None:
         envs = endless_gym.serve(ID, 4)
