@@ -494,7 +494,8 @@ def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu
         device: Device of the weights and the memories.
 
     Raises:
-        ValueError: The settings need frames or a ground truth that the environment does not have.
+        ValueError: The settings need frames or a ground truth that the environment does not have, or the observation is not made
+            of frames and vectors.
     """
     observation = settings.environment.observation
     space = spec.observation_space(Frames() if observation == "rgb" else None, observation == "features")
@@ -502,5 +503,11 @@ def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu
         space = wrappers.observation_space(settings)
     if not isinstance(space, spaces.Dict):
         space = spaces.Dict({FRAME if observation == "rgb" else "features": space})
-    shapes = {key: tuple(part.shape or ()) for key, part in space.items()}
+    for key, part in space.items():
+        if not isinstance(part, spaces.Box):
+            raise ValueError(
+                f"observations must be frames and vectors, got {part} in `{key}`; make them vectors, in environments of POPGym "
+                "by --environment.wrapper endless_gym_agents.popgym:Vectors"
+            )
+    shapes = {key: part.shape or () for key, part in space.items()}
     return Agent(settings, shapes, spec.branches, spec.ground_truth, device)

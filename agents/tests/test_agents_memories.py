@@ -34,9 +34,9 @@ def test_agents_have_as_many_parameters_as_that_of_the_gru(hidden_size: int) -> 
 
 
 def test_other_agents_cannot_be_matched() -> None:
-    with pytest.raises(ValueError, match="--recurrence.match-gru is for recurrent memories, got --agent none"):
+    with pytest.raises(ValueError, match=r"--recurrence\.match-gru is for recurrent memories, got --agent none"):
         changed(PRESETS["quick"], agent="none", recurrence={"match_gru": True}).validated()
-    with pytest.raises(ValueError, match="mingru has .* the agent gru with 4 has .*; choose a larger"):
+    with pytest.raises(ValueError, match=r"mingru has .* the agent gru with 4 has .*; choose a larger"):
         make_agent(settings("mingru", env=ID, recurrence={"hidden_size": 4, "match_gru": True}), spec(ID))
 
 
