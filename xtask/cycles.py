@@ -10,6 +10,7 @@ from pathlib import Path
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
 CRATES = [
     "agents/kernels",
+    "agents/trainer",
     "bindings/web",
     "engine/cli",
     "engine/core",

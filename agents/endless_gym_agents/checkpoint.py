@@ -23,14 +23,15 @@ from typing import Any, BinaryIO
 import torch
 
 from endless_gym.specs import spec
-from endless_gym_agents import ranges
+from endless_gym_agents import ranges, weights
 from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.settings import Settings, Transformer, from_dict
 
 #: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
 CHECKPOINT_VERSION = 1
 
-#: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it.
+#: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it. Checkpoints of
+#: `endless learn`, the trainer in Rust, end with `weights.SUFFIX` instead.
 SETTINGS = "settings.json"
 FOLDER = "checkpoints"
 LAST = "last.pt"
@@ -119,8 +120,15 @@ def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
 
 def files(run: str | Path) -> list[Path]:
     """The numbered checkpoints of a run in order of their updates, or the last checkpoint if there are none."""
-    folder = Path(run) / FOLDER
-    return sorted(folder.glob("update-*.pt")) or [folder / LAST]
+    file = last(run)
+    return sorted(file.parent.glob(f"update-*{file.suffix}")) or [file]
+
+
+def last(run: str | Path) -> Path:
+    """The last checkpoint of a run, which may not exist."""
+    file = Path(run) / FOLDER / LAST
+    of_rust = file.with_suffix(weights.SUFFIX)
+    return of_rust if of_rust.exists() and not file.exists() else file
 
 
 def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
@@ -137,13 +145,16 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     """
     file = Path(path)
     if file.is_dir():
-        file = file / FOLDER / LAST
+        file = last(file)
     if not file.exists():
         raise FileNotFoundError(
             f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
         )
-    with file.open("rb") as content:
-        state = _read(content, file)
+    if file.suffix == weights.SUFFIX:
+        state = _read_of_rust(file)
+    else:
+        with file.open("rb") as content:
+            state = _read(content, file)
     if (version := state.get("version")) != CHECKPOINT_VERSION:
         raise ValueError(
             f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; "
@@ -191,23 +202,33 @@ def _read(content: BinaryIO, file: Path) -> dict[str, Any]:
     return state
 
 
+def _read_of_rust(file: Path) -> dict[str, Any]:
+    """As `_read`, of a checkpoint of `endless learn`, without what only that program needs to resume."""
+    tensors, metadata = weights.read(file)
+    if "endless" not in metadata:
+        raise ValueError(f"{file} is not a checkpoint of `endless learn`: it has weights only")
+    header = json.loads(metadata["endless"])
+    model = {name: tensor for name, tensor in tensors.items() if not name.startswith("state/")}
+    return {**{name: header.get(name) for name in ("version", "settings", "update", "steps")}, "model": model}
+
+
 def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Settings]:
     """The agent of a saved state, and its settings."""
-    settings, weights = from_dict(state["settings"]), state["model"]
+    settings, model = from_dict(state["settings"]), state["model"]
     ranges.check(settings)
     for layers in (settings.recurrence.layers, settings.transformer.layers):
-        if layers > max(len(weights), Transformer.layers):
-            raise ValueError(f"{layers} layers need more weights than the checkpoint's {len(weights)}")
+        if layers > max(len(model), Transformer.layers):
+            raise ValueError(f"{layers} layers need more weights than the checkpoint's {len(model)}")
     if not (":" in settings.agent or settings.encoder):
         # Without memory for the weights, whose sizes the settings may exaggerate.
         with torch.device("meta"):
             expected = make_agent(settings, spec(settings.env), "meta").state_dict()
         for name, tensor in expected.items():
-            if name in weights and weights[name].shape != tensor.shape:
-                given, wanted = tuple(weights[name].shape), tuple(tensor.shape)
+            if name in model and model[name].shape != tensor.shape:
+                given, wanted = tuple(model[name].shape), tuple(tensor.shape)
                 raise ValueError(f"{name} must have shape {wanted} according to the settings, got {given}")
     agent = make_agent(settings, spec(settings.env), device)
-    agent.load_state_dict(weights)
+    agent.load_state_dict(model)
     return agent, settings
 
 

@@ -2,6 +2,7 @@
 
 ```console
 python -m endless_gym_agents.export runs/mine --out mine.agent.bin
+python -m endless_gym_agents.export runs/mine --weights mine.safetensors         # of any agent, for `endless learn --init-from`
 python -m endless_gym_agents.export mine.agent.bin --vectors mine.json   # outputs of the network, for tests of other programs
 ```
 
@@ -41,6 +42,7 @@ from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.metrics import TASK_PROGRESS
 from endless_gym_agents.ranges import Positive
 from endless_gym_agents.settings import Settings, from_dict, to_dict
+from endless_gym_agents.weights import write
 
 #: The first bytes of a file.
 MAGIC = b"ENDLAGNT"
@@ -62,6 +64,8 @@ class ExportArguments:
     """a checkpoint file, the folder of a run for its last checkpoint, or an exported file"""
     out: Path | None = None
     """file to write the agent to; needs a checkpoint"""
+    weights: Path | None = None
+    """file in the format safetensors to write the weights of a checkpoint of any agent to, for `endless learn --init-from`"""
     vectors: Path | None = None
     """JSON file to write recorded inputs and outputs of the network to"""
     vector_steps: Positive = 96
@@ -224,15 +228,18 @@ def record_vectors(agent: Agent, steps: int) -> dict[str, Any]:
 
 def execute(arguments: ExportArguments) -> None:
     """Write the files that the arguments name."""
-    if arguments.out is None and arguments.vectors is None:
-        raise ValueError("nothing to write; add --out FILE or --vectors FILE")
+    if arguments.out is None and arguments.vectors is None and arguments.weights is None:
+        raise ValueError("nothing to write; add --out FILE, --weights FILE or --vectors FILE")
     if arguments.source.is_file() and arguments.source.read_bytes()[: len(MAGIC)] == MAGIC:
-        if arguments.out is not None:
-            raise ValueError(f"--out needs a checkpoint, got the exported file {arguments.source}")
+        for flag, file in (("out", arguments.out), ("weights", arguments.weights)):
+            if file is not None:
+                raise ValueError(f"--{flag} needs a checkpoint, got the exported file {arguments.source}")
         agent = read(arguments.source)[1]
     else:
         checkpoint = load(arguments.source)
         agent = checkpoint.agent
+        if arguments.weights is not None:
+            write(arguments.weights, agent.state_dict())
         if arguments.out is not None:
             content = export(checkpoint)
             arguments.out.write_bytes(content)

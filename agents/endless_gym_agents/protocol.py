@@ -90,13 +90,15 @@ def find(paths: tuple[Path, ...], last: bool) -> list[tuple[Path, list[Path]]]:
             raise FileNotFoundError(
                 f"no such file or folder: {path}; expected a checkpoint file, the folder of a run or a folder that contains runs"
             )
-        below = sorted(folder.parent for folder in path.rglob(checkpoint.FOLDER) if any(folder.glob("*.pt")))
+        below = sorted(
+            folder.parent for folder in path.rglob(checkpoint.FOLDER) if checkpoint.last(folder.parent).exists()
+        )
         if not below:
             raise FileNotFoundError(
                 f"no checkpoint in {path}; expected the folder of a run, as endless-train writes it"
             )
         for run in below:
-            found[run] = [run / checkpoint.FOLDER / checkpoint.LAST] if last else checkpoint.files(run)
+            found[run] = [checkpoint.last(run)] if last else checkpoint.files(run)
     return list(found.items())
 
 

@@ -78,9 +78,6 @@ class Recurrence:
 
     hidden_size: Positive = 512
     """size of the hidden state"""
-    match_gru: bool = False
-    """choose the hidden size so that the agent has as many parameters, up to 5 %, as the agent gru with `hidden-size` and the
-    same other settings: for comparisons of memories. Not for transformers and baselines"""
     layers: Positive = 1
     """number of stacked recurrent layers"""
     residual: bool = False
@@ -318,8 +315,6 @@ class Settings:
         if self.agent_options() and not self.agent_class:
             classes = ", ".join(MEMORIES)
             raise ValueError(f"--agent-option is for {classes} and agents of your own, got --agent {self.agent}")
-        if self.recurrence.match_gru and not (self.agent_class or self.agent in ("gru", "lstm")):
-            raise ValueError(f"--recurrence.match-gru is for recurrent memories, got --agent {self.agent}")
         if self.encoder:
             own.load("--encoder", self.encoder, nn.Module)
         elif self.encoder_options():
@@ -495,12 +490,12 @@ def from_dict(values: dict[str, Any]) -> Settings:
 
     Raises:
         TypeError: An unknown field.
-        KeyError: A group is missing.
     """
     values = dict(values)
     for part in dataclasses.fields(Settings):
         if dataclasses.is_dataclass(kind := part.default_factory):
-            values[part.name] = kind(**values[part.name])
+            # A run of `endless learn` has only the settings that it uses.
+            values[part.name] = kind(**values.get(part.name, {}))
     # JSON has lists for tuples.
     environment = values["environment"]
     values["environment"] = dataclasses.replace(

@@ -15,16 +15,17 @@ const TOOLS: [&str; 2] = ["maturin==1.16.0", "ziglang==0.17.1"];
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, dependencies first.
-const CRATES: [&str; 11] = [
+const CRATES: [&str; 12] = [
     "endless-gym-core",
     "endless-gym-memory-gym",
     "endless-gym-popgym",
     "endless-gym-service",
     "endless-gym-page",
     "endless-gym-view",
+    "endless-gym-kernels",
+    "endless-gym-trainer",
     "endless-gym-cli",
     "endless-gym",
-    "endless-gym-kernels",
     "endless-gym-python",
     "endless-gym-web",
 ];

@@ -25,6 +25,21 @@ impl AdamW {
         AdamW { mean: vec![0.0; parameters], square: vec![0.0; parameters], updates: 0 }
     }
 
+    /// The state, for [`from_state`](Self::from_state): m, v, and the number of updates t.
+    pub fn state(&self) -> (&[f32], &[f32], i32) {
+        (&self.mean, &self.square, self.updates)
+    }
+
+    /// The optimizer in a state that [`state`](Self::state) returned.
+    ///
+    /// # Panics
+    ///
+    /// The lengths of m and v differ.
+    pub fn from_state(mean: Vec<f32>, square: Vec<f32>, updates: i32) -> Self {
+        assert_eq!(mean.len(), square.len());
+        AdamW { mean, square, updates }
+    }
+
     /// Updates the parameters.
     ///
     /// # Panics

@@ -11,6 +11,7 @@ mod film_picture;
 mod film_webp;
 mod frames;
 mod huge_pages;
+mod learn;
 mod list;
 mod logs;
 mod new;
@@ -34,6 +35,7 @@ use std::ffi::OsString;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use endless_gym_core::pool::Registry;
+use endless_gym_trainer::settings::{self, Settings};
 use nix::sys::signal::{SigSet, Signal};
 
 use failure::Failure;
@@ -79,6 +81,10 @@ enum Command {
     /// Actions are random, and resets are included. Each round measures every method once. The result is the median
     /// over the rounds, since other programs on the machine disturb single measurements.
     Bench(bench::Args),
+    /// Train an agent with a memory by PPO, from the features of the environments.
+    ///
+    /// The settings are those of the Python agents, whose tools evaluate and plot the run. `--no-NAME` stands for `--NAME=false`.
+    Learn(Box<Settings>),
     /// Replay recorded episodes of a reference implementation, and compare every observation, reward, flag and info.
     Verify(verify::Args),
     /// Check environments with random actions: seeds, snapshots, frames, spaces, limits of reset parameters.
@@ -116,7 +122,16 @@ pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, 
     let _ = SigSet::from(Signal::SIGXFSZ).thread_block();
     let mut arguments: Vec<_> = std::iter::once("endless".into()).chain(arguments).collect();
     let parse = |arguments: &[OsString]| {
-        Cli::from_arg_matches(&command(registry).try_get_matches_from(arguments)?).map_err(Failure::from)
+        let is_learning = arguments.get(1).is_some_and(|name| name == "learn");
+        let (mut command, mut arguments) = (command(registry), arguments.to_vec());
+        if is_learning {
+            arguments = settings::with_negations(&arguments);
+            let learn = command.find_subcommand_mut("learn");
+            if let Some(learn) = learn {
+                *learn = settings::with_defaults(std::mem::take(learn), &arguments)?;
+            }
+        }
+        Cli::from_arg_matches(&command.try_get_matches_from(arguments)?).map_err(Failure::from)
     };
     let cli = parse(&arguments).and_then(|cli| match cli.command {
         Some(_) => Ok(cli),
@@ -136,9 +151,10 @@ pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, 
 /// The command line, in which the first environment of the registry is the default.
 fn command(registry: &Registry) -> clap::Command {
     let Some(id) = registry.specs().next().map(|spec| spec.id) else { return Cli::command() };
-    ["demo", "serve", "play", "bench"].into_iter().fold(Cli::command(), |command, name| {
+    let names = [("demo", "id"), ("serve", "id"), ("play", "id"), ("bench", "id"), ("learn", "env")];
+    names.into_iter().fold(Cli::command(), |command, (name, argument)| {
         command.mut_subcommand(name, |command| {
-            command.mut_arg("id", |argument| argument.required(false).default_value(id))
+            command.mut_arg(argument, |argument| argument.required(false).default_value(id))
         })
     })
 }
@@ -173,6 +189,7 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::Play(args) => play_command::run(registry, &args)?,
         Command::Record(args) => record::run(registry, &args)?,
         Command::Bench(args) => bench::run(registry, &args)?,
+        Command::Learn(settings) => learn::run(registry, &settings)?,
         Command::New(args) => new::run(registry, &args)?,
         Command::Page(args) => page::run(registry, &args)?,
         Command::Frames(args) => frames::run(registry, &args)?,

@@ -6,6 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::{SigSet, Signal};
+
 use super::failure::Failure;
 
 /// How often a child process checks whether its parent is running.
@@ -49,6 +51,16 @@ pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
     *FIRST_SIGNAL.lock().unwrap_or_else(PoisonError::into_inner) = None;
     STOP.store(false, Ordering::Relaxed);
     Ok(&STOP)
+}
+
+/// Keeps SIGHUP ignored where it is, as under `nohup`, by blocking it in this thread and those that it starts. To be called before
+/// [`on_signal`].
+pub fn keep_ignored_hangup() {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| u64::from_str_radix(line.strip_prefix("SigIgn:")?.trim(), 16).ok());
+    if ignored.is_some_and(|signals| signals & 1 << (Signal::SIGHUP as u32 - 1) != 0) {
+        let _ = SigSet::from(Signal::SIGHUP).thread_block();
+    }
 }
 
 /// Sets what to do before a second signal ends the process.

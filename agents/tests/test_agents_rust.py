@@ -1,0 +1,153 @@
+"""Runs of `endless learn`, the trainer in Rust: the same numbers as those of the Python agents, which read them."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from endless_gym_agents import checkpoint, export, plot, ppo, protocol
+from endless_gym_agents.agent import Agent
+from endless_gym_agents.clock import Clock
+from endless_gym_agents.command import STOP_SIGNALS
+from endless_gym_agents.environments import Environments
+from endless_gym_agents.evaluate import evaluate
+from endless_gym_agents.logs import read_progress
+from endless_gym_agents.rollout import RolloutCollector
+from endless_gym_agents.run_folder import RunInUse, locked
+from endless_gym_agents.train import parse, train
+from endless_gym_agents.weights import read
+
+FLAGS = "--environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 16 --recurrence.sequence-length 6 "
+FLAGS += "--recurrence.hidden-size 16 --model.head-width 8 --ppo.minibatches 1 --no-stop-when-learnt --keep-checkpoints"
+PROGRAM = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())", "learn"]
+
+
+def learn(arguments: str, fails: bool = False) -> str:
+    """Run `endless learn`, and return what it printed."""
+    result = subprocess.run([*PROGRAM, *arguments.split()], capture_output=True, text=True, timeout=120)
+    assert result.returncode == fails, result.stderr
+    return result.stderr if fails else result.stdout
+
+
+def new_run(run: Path, flags: str) -> Path:
+    learn(f"MortarMayhem-Grid-v0 {FLAGS} --run {run} {flags}")
+    return run
+
+
+def numbered(run: Path, update: int) -> checkpoint.Checkpoint:
+    return checkpoint.load(run / "checkpoints" / f"update-{update:06d}.safetensors")
+
+
+def noise_of(seed: int, update: int, shape: tuple[int, ...]) -> Tensor:
+    """The Gumbel noise of an update, from the same uniform numbers."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(1, update))
+    uniform = np.random.Generator(np.random.PCG64(sequence)).random(shape, dtype=np.float32)
+    return torch.from_numpy(-np.log(-np.log(np.maximum(uniform, np.finfo(np.float32).tiny))))
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        "--agent gru --recurrence.layers 2 --recurrence.residual",
+        "--agent gru --ppo.advantage-normalisation none --recurrence.no-embedding",
+        "--agent mingru --recurrence.layers 2 --ppo.advantage-normalisation batch",
+    ],
+)
+def test_one_update_equals_that_of_the_python_agents(
+    flags: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = new_run(tmp_path / "run", f"{flags} --ppo.updates 1 --threads 2")
+    before, after = numbered(run, 0), numbered(run, 1)
+    settings, agent = before.settings, before.agent
+    monkeypatch.setattr(Agent, "noise", lambda self, shape, generator: noise_of(1, 0, (*shape, 1, agent.branches[0])))
+    with Environments(settings) as environments:
+        collector = RolloutCollector(agent, environments, settings.ppo.steps, torch.Generator())
+        segment, ended = collector.collect(Clock())
+        optimizer = ppo.make_optimizer(agent, settings.ppo.learning_rate)
+        states = [memory.state for memory in collector.memories]
+        # The only minibatch has all sequences, so their order does not matter.
+        metrics = ppo.learn(agent, optimizer, segment, states, 0, settings.ppo, torch.Generator())
+    (row,) = read_progress(run)
+    assert ended and row["episode/length"] == pytest.approx(np.mean([episode["length"] for episode in ended]))
+    assert {name for name in row if "/" not in name} == {*metrics, "update", "steps", "steps_per_second"}
+    for name, number in metrics.items():
+        assert row[name] == pytest.approx(number, rel=1e-4, abs=1e-4), name
+    for name, weights in agent.state_dict().items():
+        assert torch.allclose(after.agent.state_dict()[name], weights, rtol=0, atol=1e-4), name
+
+
+def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = new_run(tmp_path / "run", "--ppo.updates 3 --checkpoint-interval 1")
+    ((found, files),) = protocol.find((tmp_path,), False)
+    assert found == run and [file.stem for file in files] == [f"update-{update:06d}" for update in range(4)]
+    loaded = checkpoint.load(run)
+    assert (loaded.update, loaded.steps, loaded.settings.env) == (3, 3 * 8 * 16, "MortarMayhem-Grid-v0")
+    assert len(evaluate(loaded.agent, range(200_000, 200_003), 1, num_threads=1)) == 3
+    monkeypatch.setattr(sys, "argv", ["endless-plot", str(run), "--out", str(tmp_path / "plots")])
+    assert plot.main() == 0 and any((tmp_path / "plots").glob("*.png"))
+    with pytest.raises(ValueError, match=r"cannot be resumed.*--init-from"):
+        loaded.resumable()
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(run)).Reload()
+    row = read_progress(run)[-1]
+    assert [event.step for event in events.Scalars("learning/loss")] == [128, 256, 384]
+    assert events.Scalars("episode/reward")[-1].value == pytest.approx(row["episode/reward"])
+
+
+def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = new_run(tmp_path / "rust", "--ppo.updates 1")
+    given = parse(f"--env MortarMayhem-Grid-v0 --preset quick {FLAGS} --threads 1 --ppo.updates 1".split())
+    ours = train(replace(given, run=str(tmp_path / "python"), init_from=str(run)))
+    started = checkpoint.load(ours / "checkpoints" / "update-000000.pt").agent.state_dict()
+    assert all(torch.equal(weights, started[name]) for name, weights in checkpoint.load(run).agent.state_dict().items())
+    file = tmp_path / "exported.safetensors"
+    monkeypatch.setattr(sys, "argv", ["export", str(ours), "--weights", str(file)])
+    assert export.main() == 0
+    started = numbered(new_run(tmp_path / "next", f"--init-from {file} --ppo.updates 1"), 0).agent.state_dict()
+    trained = checkpoint.load(ours).agent.state_dict()
+    assert all(torch.equal(weights, started[name]) for name, weights in trained.items())
+    assert set(read(file)[0]) == set(trained)
+
+
+@contextmanager
+def training(run: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that trains in `run`, after its first update, until it is killed."""
+    arguments = f"--resume {run}" if run.exists() else f"MortarMayhem-Grid-v0 {FLAGS} --run {run}"
+    flags = "--ppo.updates 1000000 --checkpoint-interval 1 --no-keep-checkpoints"
+    command = [*PROGRAM, *arguments.split(), *flags.split()]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert "Ctrl-C stops the run" in process.stdout.readline()
+            assert " steps " in process.stdout.readline()
+            yield process
+        finally:
+            process.kill()
+
+
+def test_signals_end_a_run_with_a_checkpoint_and_a_killed_one_resumes(tmp_path: Path) -> None:
+    run, updates = tmp_path / "run", 0
+    for number in (*STOP_SIGNALS, signal.SIGKILL):
+        with training(run) as process:
+            with pytest.raises(RunInUse, match=f"in use by process {process.pid} on "), locked(run):
+                pass
+            process.send_signal(number)
+            process.communicate(timeout=60)
+        saved, rows = checkpoint.load(run).update, len(read_progress(run))
+        if number == signal.SIGKILL:
+            assert process.returncode == -number and rows - 1 <= saved <= rows
+        else:
+            assert process.returncode == 0 and saved == rows > updates and not (run / "lock").exists()
+        updates = saved
+    with locked(run):
+        assert "in use by process" in learn(f"--resume {run} --ppo.updates 1", fails=True)
+    assert f"{updates} of 1 updates done" in learn(f"--resume {run} --ppo.updates 1")

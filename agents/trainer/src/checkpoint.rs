@@ -1,0 +1,247 @@
+//! Checkpoints: the state from which a run resumes exactly, in the format safetensors.
+//!
+//! The weights have their names and shapes in PyTorch's `state_dict`, so that any reader of the format finds them. The other tensors
+//! begin with `state/`, and the rest is JSON text in the entry [`METADATA`] of the metadata. The random numbers need no state: each update
+//! has a generator of its own.
+
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use endless_gym_kernels::adamw::AdamW;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, file};
+use crate::metrics::Episode;
+use crate::network::Network;
+use crate::rollout::Player;
+use crate::settings::Settings;
+
+/// Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed.
+const VERSION: u32 = 1;
+/// The entry of the metadata.
+const METADATA: &str = "endless";
+/// Names in the folder of a run: the folder of the checkpoints, and the last checkpoint in it.
+const FOLDER: &str = "checkpoints";
+const LAST: &str = "last.safetensors";
+
+/// What a checkpoint holds besides numbers.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    version: u32,
+    update: u64,
+    steps: u64,
+    optimizer_updates: i32,
+    episodes: Vec<Episode>,
+    settings: Settings,
+}
+
+/// Writes a checkpoint as the last one of a run, atomically, and with `keep` also under the number of its update.
+///
+/// # Errors
+///
+/// [`Error::File`], as on a full disk; the former checkpoint stays the last one. The errors of the environments.
+#[allow(clippy::too_many_arguments)]
+pub fn save(
+    run: &Path,
+    settings: &Settings,
+    (update, steps): (u64, u64),
+    network: &Network,
+    optimizer: &AdamW,
+    player: &mut Player,
+    keep: bool,
+) -> Result<(), Error> {
+    let (mean, square, optimizer_updates) = optimizer.state();
+    let episodes = player.episodes.iter().cloned().collect();
+    let header = Header { version: VERSION, update, steps, optimizer_updates, episodes, settings: settings.clone() };
+    let header = serde_json::to_string(&header).map_err(Error::json(METADATA))?;
+    let snapshots = player.environments.snapshots()?;
+    let lengths: Vec<u64> = snapshots.iter().map(|snapshot| snapshot.len() as u64).collect();
+    let (snapshots, starts) =
+        (snapshots.concat(), player.starts.iter().map(|start| u8::from(*start)).collect::<Vec<_>>());
+
+    let floats = |name: &str, numbers: &[f32], shape: Vec<usize>| {
+        (name.to_owned(), Dtype::F32, shape, bytemuck::cast_slice(numbers).to_vec())
+    };
+    let weights =
+        network.tensors.iter().map(|t| floats(&t.name, &network.parameters[t.range.clone()], t.shape.clone()));
+    let hidden = player.hidden.iter().enumerate().map(|(layer, hidden)| {
+        floats(&format!("state/hidden/{layer}"), hidden, vec![starts.len(), network.hidden_size])
+    });
+    let others = [
+        floats("state/optimizer/mean", mean, vec![mean.len()]),
+        floats("state/optimizer/square", square, vec![square.len()]),
+        ("state/starts".to_owned(), Dtype::U8, vec![starts.len()], starts.clone()),
+        ("state/environments".to_owned(), Dtype::U8, vec![snapshots.len()], snapshots),
+        ("state/lengths".to_owned(), Dtype::U64, vec![lengths.len()], bytemuck::cast_slice(&lengths).to_vec()),
+    ];
+    let folder = run.join(FOLDER);
+    let (last, temporary) = (folder.join(LAST), folder.join(format!("{LAST}.new")));
+    let tensors: Vec<_> = weights.chain(hidden).chain(others).collect();
+    let views = tensors
+        .iter()
+        .map(|(name, dtype, shape, bytes)| Ok((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?)));
+    let wrong = |error: safetensors::SafeTensorError| Error::Checkpoint { path: last.clone(), what: error.to_string() };
+    let views = views.collect::<Result<Vec<_>, _>>().map_err(wrong)?;
+    let metadata = [(METADATA.to_owned(), header)].into_iter().collect();
+    let content = safetensors::serialize(views, Some(metadata)).map_err(wrong)?;
+
+    let write = || {
+        fs::create_dir_all(&folder)?;
+        let mut file = File::create(&temporary)?;
+        file.write_all(&content)?;
+        file.sync_all()?;
+        if keep {
+            // A hard link: the same file under a second name.
+            let numbered = folder.join(format!("update-{update:06}.safetensors"));
+            let _ = fs::remove_file(&numbered);
+            fs::hard_link(&temporary, numbered)?;
+        }
+        fs::rename(&temporary, &last)
+    };
+    write().map_err(|source| {
+        let _ = fs::remove_file(&temporary);
+        Error::File { path: last.clone(), source }
+    })
+}
+
+/// The content of a checkpoint file.
+pub struct Checkpoint {
+    path: PathBuf,
+    content: Vec<u8>,
+}
+
+impl Checkpoint {
+    /// Reads a checkpoint file, or the last checkpoint of the run in a folder.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Checkpoint`] if there is none.
+    pub fn read(path: &Path) -> Result<Self, Error> {
+        let path = if path.is_dir() { path.join(FOLDER).join(LAST) } else { path.to_owned() };
+        if !path.exists() {
+            return Err(Error::Checkpoint { path, what: "does not exist".to_owned() });
+        }
+        let content = fs::read(&path).map_err(file(&path))?;
+        Ok(Checkpoint { path, content })
+    }
+
+    fn wrong(&self, what: impl Into<String>) -> Error {
+        Error::Checkpoint { path: self.path.clone(), what: what.into() }
+    }
+
+    fn tensors(&self) -> Result<SafeTensors<'_>, Error> {
+        SafeTensors::deserialize(&self.content).map_err(|error| self.wrong(format!("is damaged: {error}")))
+    }
+
+    /// The numbers of a tensor, which must have this type and shape.
+    fn numbers<T: bytemuck::AnyBitPattern>(
+        &self,
+        tensors: &SafeTensors<'_>,
+        name: &str,
+        dtype: Dtype,
+        shape: &[usize],
+    ) -> Result<Vec<T>, Error> {
+        let tensor = tensors.tensor(name).map_err(|_| self.wrong(format!("has no {name}")))?;
+        if tensor.dtype() != dtype || tensor.shape() != shape {
+            let given = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
+            return Err(self.wrong(format!("must have {name} of {dtype:?} {shape:?}, got {given}")));
+        }
+        Ok(tensor.data().chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned).collect())
+    }
+
+    /// Sets the weights of a network.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Checkpoint`] if a weight is missing, has another shape, or is not finite.
+    fn load_weights(&self, tensors: &SafeTensors<'_>, network: &mut Network) -> Result<(), Error> {
+        for tensor in network.tensors.clone() {
+            let weights: Vec<f32> = self.numbers(tensors, &tensor.name, Dtype::F32, &tensor.shape)?;
+            if weights.iter().any(|weight| !weight.is_finite()) {
+                return Err(self.wrong(format!("has weights that are not finite, in {}", tensor.name)));
+            }
+            network.parameters[tensor.range].copy_from_slice(&weights);
+        }
+        network.pack();
+        Ok(())
+    }
+
+    /// Sets the state of a run with the same settings, and returns the number of updates and of steps so far.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Checkpoint`] if it does not fit, and the errors of the environments.
+    pub fn resume(
+        &self,
+        network: &mut Network,
+        optimizer: &mut AdamW,
+        player: &mut Player,
+    ) -> Result<(u64, u64), Error> {
+        let tensors = self.tensors()?;
+        let metadata = SafeTensors::read_metadata(&self.content).map_err(|error| self.wrong(error.to_string()))?.1;
+        let text = metadata.metadata().as_ref().and_then(|entries| entries.get(METADATA));
+        let text = text.ok_or_else(|| self.wrong("cannot be resumed, as it has weights only; use --init-from"))?;
+        let header: Header = serde_json::from_str(text).map_err(Error::json(self.path.display()))?;
+        if header.version != VERSION {
+            return Err(self.wrong(format!("must be of version {VERSION}, got {}", header.version)));
+        }
+        self.load_weights(&tensors, network)?;
+        let count = [network.parameters.len()];
+        let mean = self.numbers(&tensors, "state/optimizer/mean", Dtype::F32, &count)?;
+        let square = self.numbers(&tensors, "state/optimizer/square", Dtype::F32, &count)?;
+        *optimizer = AdamW::from_state(mean, square, header.optimizer_updates);
+        let num_envs = player.starts.len();
+        for (layer, hidden) in player.hidden.iter_mut().enumerate() {
+            let shape = [num_envs, network.hidden_size];
+            *hidden = self.numbers(&tensors, &format!("state/hidden/{layer}"), Dtype::F32, &shape)?;
+        }
+        let starts: Vec<u8> = self.numbers(&tensors, "state/starts", Dtype::U8, &[num_envs])?;
+        player.starts = starts.iter().map(|start| *start != 0).collect();
+        player.episodes = header.episodes.into();
+        let lengths: Vec<u64> = self.numbers(&tensors, "state/lengths", Dtype::U64, &[num_envs])?;
+        let total = lengths.iter().try_fold(0, |sum: usize, length| sum.checked_add(usize::try_from(*length).ok()?));
+        let total = total.ok_or_else(|| self.wrong("has invalid lengths of snapshots"))?;
+        let bytes: Vec<u8> = self.numbers(&tensors, "state/environments", Dtype::U8, &[total])?;
+        let mut rest = &bytes[..];
+        let snapshots = lengths.iter().map(|length| {
+            let (snapshot, after) = rest.split_at(*length as usize);
+            rest = after;
+            snapshot.to_vec()
+        });
+        let snapshots: Vec<_> = snapshots.collect();
+        player.environments.restore(&snapshots)?;
+        for group in 0..player.environments.groups {
+            player.environments.receive(group)?;
+        }
+        Ok((header.update, header.steps))
+    }
+
+    /// Copies weights into a new network; the encoder and the heads keep theirs where shapes differ. Returns a line of text that says
+    /// which weights were copied.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Checkpoint`] if the memories or the layers after them differ.
+    pub fn start(&self, network: &mut Network) -> Result<String, Error> {
+        let (tensors, mut missing) = (self.tensors()?, Vec::new());
+        for tensor in network.tensors.clone() {
+            match self.numbers::<f32>(&tensors, &tensor.name, Dtype::F32, &tensor.shape) {
+                Ok(weights) if weights.iter().all(|weight| weight.is_finite()) => {
+                    network.parameters[tensor.range].copy_from_slice(&weights);
+                }
+                Ok(_) => return Err(self.wrong(format!("has weights that are not finite, in {}", tensor.name))),
+                Err(error) if ["memory.", "body."].iter().any(|part| tensor.name.starts_with(part)) => {
+                    return Err(error);
+                }
+                Err(_) => missing.push(tensor.name),
+            }
+        }
+        network.pack();
+        let (all, path) = (network.tensors.len(), self.path.display());
+        let others =
+            if missing.is_empty() { String::new() } else { format!("; newly initialised: {}", missing.join(", ")) };
+        Ok(format!("started from {} of {all} tensors of {path}{others}", all - missing.len()))
+    }
+}

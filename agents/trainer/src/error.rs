@@ -1,0 +1,129 @@
+//! The errors of a run.
+
+use std::fmt::Display;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use endless_gym_core::envs::{ParameterError, UnknownEnvironment};
+use endless_gym_core::pool::{PoolError, SnapshotError};
+use endless_gym_service::ServiceError;
+use thiserror::Error;
+
+/// Why a run did not start, or stopped early.
+#[derive(Debug, Error)]
+pub enum Error {
+    /// A setting, or a combination of them, is invalid; the text says what is allowed.
+    #[error("{0}")]
+    Settings(String),
+    /// The environment has actions or observations that the agents do not support.
+    #[error("{id} cannot be learnt here: {what}")]
+    Unsupported {
+        /// Environment id.
+        id: String,
+        /// What is missing.
+        what: &'static str,
+    },
+    /// The folder has no run.
+    #[error("no run in {}; expected a folder with settings.json, as `endless learn` writes it", run.display())]
+    NoRun {
+        /// The folder.
+        run: PathBuf,
+    },
+    /// The folder of a new run has another run.
+    #[error("{0} already contains a run; continue it with --resume {0}, or choose another folder", run.display())]
+    RunExists {
+        /// The folder.
+        run: PathBuf,
+    },
+    /// Another process trains in the folder.
+    #[error("{} is in use by {holder}; wait until it ends, or choose another folder", run.display())]
+    RunInUse {
+        /// The folder.
+        run: PathBuf,
+        /// The other process.
+        holder: String,
+    },
+    /// A checkpoint is missing, damaged, or does not fit.
+    #[error("checkpoint {} {what}", path.display())]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
+    /// The loss, the gradient or the weights are no longer finite.
+    #[error(
+        "update {update} diverged: its {what} is {value}; try a smaller --ppo.learning-rate (now {learning_rate}) or \
+         --ppo.max-gradient-norm (now {max_gradient_norm}); with --resume {}, which has a checkpoint of update {saved}",
+        run.display()
+    )]
+    Diverged {
+        /// Number of the update, from 1.
+        update: u64,
+        /// What is not finite.
+        what: &'static str,
+        /// Its value.
+        value: f64,
+        /// The learning rate of the update.
+        learning_rate: f64,
+        /// The limit of the gradient's norm.
+        max_gradient_norm: f64,
+        /// The folder of the run.
+        run: PathBuf,
+        /// The update of the last checkpoint.
+        saved: u64,
+    },
+    /// A file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// A file or a text is not the expected JSON.
+    #[error("{what} is not of this version of `endless learn`: {source}")]
+    Json {
+        /// The file.
+        what: String,
+        /// Where it differs.
+        source: serde_json::Error,
+    },
+    /// The threads cannot be started.
+    #[error("cannot start --threads {count}: {reason}")]
+    Threads {
+        /// Number of threads.
+        count: usize,
+        /// Why not.
+        reason: String,
+    },
+    /// The environment id is unknown.
+    #[error(transparent)]
+    UnknownEnvironment(#[from] UnknownEnvironment),
+    /// A reset parameter is invalid.
+    #[error(transparent)]
+    Parameter(#[from] ParameterError),
+    /// The environments report an error.
+    #[error(transparent)]
+    Pool(#[from] PoolError),
+    /// An environment cannot be saved or restored.
+    #[error(transparent)]
+    Snapshot(#[from] SnapshotError),
+    /// The engine reports an error.
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+}
+
+/// Turns an error of a file into an [`Error`].
+pub(crate) fn file(path: &Path) -> impl FnOnce(io::Error) -> Error {
+    let path = path.to_owned();
+    |source| Error::File { path, source }
+}
+
+impl Error {
+    /// Turns an error of JSON into an [`Error`].
+    pub(crate) fn json(what: impl Display) -> impl FnOnce(serde_json::Error) -> Error {
+        let what = what.to_string();
+        |source| Error::Json { what, source }
+    }
+}

@@ -1,0 +1,272 @@
+//! Whole runs, in this process and with an engine.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use clap::{Args, Command, FromArgMatches};
+use endless_gym_core::random::Generator;
+use endless_gym_kernels::sequences::Sequences;
+use endless_gym_memory_gym::memory_gym;
+use endless_gym_service::{ConnectConfig, Engine, EngineConfig, Namespace, Trainer};
+use endless_gym_trainer::environments::{Environments, pool_config};
+use endless_gym_trainer::error::Error;
+use endless_gym_trainer::learn;
+use endless_gym_trainer::network::{Network, Pass};
+use endless_gym_trainer::settings::{Settings, with_defaults, with_negations};
+use safetensors::SafeTensors;
+use serde_json::Value as Json;
+
+/// A short run with small networks, on two layers and sequences shorter than a segment.
+const SMALL: &str = "MortarMayhem-Grid-v0 --environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 24 \
+                     --recurrence.sequence-length 10 --recurrence.hidden-size 16 --recurrence.layers 2 --model.head-width 8 \
+                     --ppo.minibatches 2 --no-stop-when-learnt --ppo.updates 4";
+
+fn parse(text: &str) -> Result<Settings, String> {
+    let arguments: Vec<_> = std::iter::once("learn").chain(text.split_whitespace()).map(Into::into).collect();
+    let arguments = with_negations(&arguments);
+    let command = with_defaults(Settings::augment_args(Command::new("learn")), &arguments);
+    let matches = command.map_err(|error| error.to_string())?.try_get_matches_from(arguments);
+    Settings::from_arg_matches(&matches.map_err(|error| error.to_string())?).map_err(|error| error.to_string())
+}
+
+fn settings(text: &str) -> Settings {
+    parse(text).unwrap()
+}
+
+/// A folder that is removed at the end.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("endless-learn-{name}-{}", std::process::id()));
+        let _ = fs::remove_dir_all(&path);
+        fs::create_dir(&path).unwrap();
+        Folder(path)
+    }
+
+    fn run(&self, name: &str, arguments: &str) -> PathBuf {
+        try_run(&format!("{SMALL} --run {}/{name} {arguments}", self.0.display())).unwrap()
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+fn try_run(arguments: &str) -> Result<PathBuf, Error> {
+    let environments = |settings: &Settings| Environments::in_process(memory_gym(), settings);
+    learn(&settings(arguments), environments, &AtomicBool::new(false))
+}
+
+/// The tensors of a run's last checkpoint by name, as bytes.
+fn tensors(run: &Path) -> Vec<(String, Vec<u8>)> {
+    let content = fs::read(run.join("checkpoints/last.safetensors")).unwrap();
+    let tensors = SafeTensors::deserialize(&content).unwrap();
+    let mut found: Vec<_> =
+        tensors.tensors().into_iter().map(|(name, tensor)| (name, tensor.data().to_vec())).collect();
+    found.sort();
+    assert!(found.len() > 15);
+    found
+}
+
+/// The rows of a run's `progress.jsonl`, without what depends on the time.
+fn progress(run: &Path) -> Vec<Json> {
+    let text = fs::read_to_string(run.join("progress.jsonl")).unwrap();
+    let rows = text.lines().map(|line| {
+        let mut row: serde_json::Map<String, Json> = serde_json::from_str(line).unwrap();
+        row.retain(|name, _| name != "steps_per_second" && !name.starts_with("seconds/"));
+        Json::Object(row)
+    });
+    rows.collect()
+}
+
+fn assert_same(run: &Path, other: &Path) {
+    assert!(tensors(run) == tensors(other), "{} and {} differ", run.display(), other.display());
+    assert_eq!(progress(run), progress(other));
+}
+
+#[test]
+fn a_resumed_run_continues_with_the_same_bits() {
+    let folder = Folder::new("resume");
+    for agent in ["gru", "mingru"] {
+        let whole = folder.run(&format!("{agent}-whole"), &format!("--agent {agent}"));
+        let run = folder.run(&format!("{agent}-parts"), &format!("--agent {agent} --ppo.updates 2"));
+        assert!(tensors(&whole) != tensors(&run));
+        // As if the process had been killed while it wrote a row.
+        let rows = fs::read_to_string(run.join("progress.jsonl")).unwrap();
+        fs::write(run.join("progress.jsonl"), format!("{rows}{{\"update\": 3}}\n{{\"upda")).unwrap();
+        let resumed = try_run(&format!("--resume {} --ppo.updates 4", run.display())).unwrap();
+        assert_same(&whole, &resumed);
+        assert_eq!(progress(&resumed).len(), 4);
+    }
+}
+
+#[test]
+fn results_depend_neither_on_threads_nor_on_groups() {
+    let folder = Folder::new("threads");
+    let expected = folder.run("one", "--threads 1 --environment.num-envs 32 --ppo.minibatches 1");
+    let found = folder.run("three", "--threads 3 --environment.num-envs 32 --ppo.minibatches 1");
+    assert_same(&expected, &found);
+    let groups = "--threads 1 --environment.num-envs 32 --ppo.minibatches 1 --environment.groups 2";
+    assert_same(&expected, &folder.run("groups", groups));
+}
+
+#[test]
+fn a_run_with_an_engine_is_the_same_as_in_process() {
+    let folder = Folder::new("engine");
+    let expected = folder.run("expected", "");
+    let namespace = Namespace::at(folder.0.join("root"));
+    let arguments = format!("{SMALL} --run {}/served --environment.groups 2", folder.0.display());
+    let settings = settings(&arguments);
+    let pool = pool_config(memory_gym(), &settings).unwrap();
+    let config = EngineConfig { groups: 2, namespace: namespace.clone(), ..EngineConfig::new("learn", pool, 1) };
+    let mut engine = Engine::new(memory_gym(), &config).unwrap();
+    let stop = AtomicBool::new(false);
+    let run = std::thread::scope(|scope| {
+        let running = scope.spawn(|| engine.run(&stop));
+        let connect = ConnectConfig { namespace, timeout: Duration::from_secs(10), ..ConnectConfig::new("learn") };
+        let connected = Trainer::connect(&connect);
+        let run = connected.map_err(Error::from).and_then(|trainer| {
+            let environments = |settings: &Settings| Environments::served(memory_gym(), settings, trainer);
+            learn(&settings, environments, &AtomicBool::new(false))
+        });
+        stop.store(true, Ordering::Relaxed);
+        running.join().unwrap().unwrap();
+        run.unwrap()
+    });
+    assert_same(&expected, &run);
+}
+
+#[test]
+fn a_run_that_diverges_keeps_its_last_healthy_checkpoint() {
+    let folder = Folder::new("diverged");
+    let run = folder.run("run", "--ppo.updates 1");
+    let healthy = tensors(&run);
+    let resume = format!("--resume {} --ppo.updates 9 --ppo.learning-rate 1e30", run.display());
+    let error = try_run(&resume).unwrap_err();
+    assert!(matches!(error, Error::Diverged { saved: 1, .. }), "{error}");
+    assert!(error.to_string().contains("try a smaller --ppo.learning-rate"), "{error}");
+    assert!(tensors(&run) == healthy);
+}
+
+#[test]
+fn a_stopped_run_writes_a_checkpoint() {
+    let folder = Folder::new("stopped");
+    let settings = settings(&format!("{SMALL} --run {}/run", folder.0.display()));
+    let environments = |settings: &Settings| Environments::in_process(memory_gym(), settings);
+    let run = learn(&settings, environments, &AtomicBool::new(true)).unwrap();
+    assert_eq!(progress(&run).len(), 1);
+    let one = folder.run("one", "--ppo.updates 1");
+    assert!(tensors(&run) == tensors(&one));
+    assert!(!run.join("lock").exists());
+}
+
+#[test]
+fn errors_say_what_is_allowed_and_leave_nothing() {
+    let folder = Folder::new("errors");
+    let at = folder.0.display();
+    let new = format!("{SMALL} --run {at}/new");
+    for (arguments, expected) in [
+        (format!("{new} --environment.groups 3"), "must be a multiple of --environment.groups, got 8 environments"),
+        (format!("{new} --ppo.minibatches 193"), "--ppo.minibatches must be 1 to 192"),
+        (format!("{new} --environment.option x"), "must be NAME=VALUE with a JSON value"),
+        (format!("{new} --environment.option colour=1"), "colour"),
+        (format!("{new} --threads 5000"), "--threads 5000: at most 1024"),
+        (format!("{new} --init-from {at}/nowhere"), "nowhere does not exist"),
+        (format!("{new} --init-from /dev/null"), "is damaged"),
+        (format!("Nothing-v0 --run {at}/new"), "no environment `Nothing-v0`"),
+    ] {
+        let error = try_run(&arguments).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+        assert!(!folder.0.join("new").exists(), "{error}");
+    }
+    for (arguments, expected) in [
+        ("--ppo.gamma 1.5", "must be a number from 0 to 1"),
+        ("--ppo.learning-rate nan", "must be a finite number, 0 or more"),
+        ("--recurrence.hidden-size 100000000", "must be an integer, 1 to 16384"),
+        ("--agent lstm", "[possible values: gru, mingru]"),
+        ("--resume /nowhere", "no run in /nowhere; expected a folder with settings.json"),
+    ] {
+        let error = parse(arguments).unwrap_err();
+        assert!(error.contains(expected), "{error}");
+    }
+    let run = folder.run("run", "--ppo.updates 1");
+    let error = try_run(&format!("{SMALL} --run {}", run.display())).unwrap_err();
+    assert!(matches!(error, Error::RunExists { .. }), "{error}");
+    let error = try_run(&format!("--resume {} --recurrence.layers 3", run.display())).unwrap_err().to_string();
+    assert!(error.contains("must keep its recurrence.layers: expected 2, got 3"), "{error}");
+    // Every truncated checkpoint is refused.
+    let file = run.join("checkpoints/last.safetensors");
+    let content = fs::read(&file).unwrap();
+    for length in [0, 7, 8, 100, content.len() / 2, content.len() - 1] {
+        fs::write(&file, &content[..length]).unwrap();
+        let error = try_run(&format!("--resume {} --ppo.updates 2", run.display())).unwrap_err();
+        assert!(matches!(error, Error::Checkpoint { .. }), "{error}");
+    }
+}
+
+#[test]
+fn presets_and_runs_to_resume_replace_defaults() {
+    let paper = settings("MortarMayhem-v0 --preset paper --no-recurrence.embedding").validated();
+    assert!(paper.is_err() || !paper.unwrap().recurrence.residual);
+    let paper =
+        settings("MortarMayhem-v0 --preset=paper --recurrence.no-embedding --ppo.steps 64").validated().unwrap();
+    assert_eq!((paper.recurrence.hidden_size, paper.ppo.steps, paper.ppo.updates), (512, 64, 240_000));
+    assert!(!paper.recurrence.embedding && !paper.stop_when_learnt);
+    let folder = Folder::new("defaults");
+    let run = folder.run("run", "--ppo.updates 1 --time-limit 5 --environment.option arena_size=6");
+    let resumed = settings(&format!("--resume={}", run.display()));
+    assert_eq!((resumed.environment.num_envs, resumed.time_limit, resumed.ppo.updates), (8, 0.0, 1));
+    assert_eq!(resumed.environment.option, ["command_count=[1]", "arena_size=6"]);
+}
+
+#[test]
+fn gradients_equal_finite_differences() {
+    for agent in ["gru", "mingru"] {
+        for residual in ["", "--recurrence.residual"] {
+            let settings =
+                settings(&format!("{SMALL} --agent {agent} {residual} --model.value-gain 1 --model.vector-width 5"));
+            let mut random = Generator::from_seed(8);
+            let mut network = Network::new(&settings, 4, &[3, 2], &mut random);
+            let (sizes, resets) = ([3, 3, 2], [true, false, false, false, true, false, false, false]);
+            let sequences = Sequences::new(&sizes, &resets).unwrap();
+            let mut normals = |count: usize| (0..count).map(|_| random.standard_normal() as f32).collect::<Vec<f32>>();
+            let states = vec![normals(3 * 16), normals(3 * 16)];
+            let (observations, grad_logits, grad_values) = (normals(8 * 4), normals(8 * 5), normals(8));
+            let mut pass = Pass::default();
+            (pass.observations, pass.states) = (observations, states);
+            (pass.grad_logits, pass.grad_values) = (grad_logits, grad_values);
+            let loss = |network: &Network, pass: &mut Pass| {
+                network.forward(sequences, pass);
+                let dot =
+                    |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+                dot(&pass.logits, &pass.grad_logits) + dot(&pass.values, &pass.grad_values)
+            };
+            network.forward(sequences, &mut pass);
+            network.backward(sequences, &mut pass);
+            for tensor in network.tensors.clone() {
+                let gradient = pass.gradients[tensor.range.clone()].to_vec();
+                // Along the gradient, the loss changes by the square of its norm.
+                let square: f64 = gradient.iter().map(|g| f64::from(g * g)).sum();
+                assert!(square > 0.0, "{}", tensor.name);
+                let step = 2e-3 / square.sqrt();
+                let mut moved = |sign: f64| {
+                    for (weight, gradient) in network.parameters[tensor.range.clone()].iter_mut().zip(&gradient) {
+                        *weight += (sign * step * f64::from(*gradient)) as f32;
+                    }
+                    network.pack();
+                    loss(&network, &mut pass)
+                };
+                let (up, down) = (moved(1.0), moved(-2.0));
+                moved(1.0);
+                let expected = 2.0 * step * square;
+                let error = (up - down - expected).abs() / expected;
+                assert!(error < 0.02, "{agent} {residual} {}: {} instead of {expected}", tensor.name, up - down);
+            }
+        }
+    }
+}
