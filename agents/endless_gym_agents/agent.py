@@ -175,6 +175,10 @@ class Agent(nn.Module):
         """
         super().__init__()
         self.settings, self.device = settings, torch.device(device)
+        recurrence = settings.recurrence
+        if recurrence.match_gru:
+            size = matched_hidden_size(settings, shapes, branches, ground_truth)
+            recurrence = dataclasses.replace(recurrence, hidden_size=size)
         self.branches = tuple(branches)
         #: Shapes of one environment's observation, by key.
         self.observation_shapes = {key: tuple(shape) for key, shape in shapes.items()}
@@ -190,14 +194,14 @@ class Agent(nn.Module):
             self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
         self.memory: AnyMemory
         if settings.agent == "gru" or settings.agent == "lstm":
-            self.memory = RecurrentMemory(settings.agent, self.encoder.width, settings.recurrence, self.device)
+            self.memory = RecurrentMemory(settings.agent, self.encoder.width, recurrence, self.device)
         elif settings.agent == "trxl" or settings.agent == "gtrxl":
             gating = settings.transformer.gating or settings.agent == "gtrxl"
             transformer = dataclasses.replace(settings.transformer, window=settings.window(), gating=gating)
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
         elif settings.agent_class:
             layer = own.load("--agent", settings.agent_class, nn.Module)
-            arguments = self.encoder.width, settings.recurrence, settings.agent_options(), self.device
+            arguments = self.encoder.width, recurrence, settings.agent_options(), self.device
             if issubclass(layer, SequenceModel):
                 self.memory = SequenceMemory(layer, *arguments)
             else:
@@ -205,7 +209,7 @@ class Agent(nn.Module):
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
         has_memory = not isinstance(self.memory, NoMemory)
-        width = settings.model.body_width or (self.memory.width if has_memory else settings.recurrence.hidden_size)
+        width = settings.model.body_width or (self.memory.width if has_memory else recurrence.hidden_size)
         self.body = nn.Sequential(orthogonal(nn.Linear(self.memory.width, width)), nn.ReLU())
         self.policy = PolicyHead(width, settings.model.head_width, branches)
         self.value = ValueHead(width, settings.model.head_width, settings.model.value_gain)
@@ -441,6 +445,46 @@ class Agent(nn.Module):
         return self
 
 
+def matched_hidden_size(settings: Settings, shapes: Shapes, branches: Sequence[int], ground_truth: int) -> int:
+    """The hidden size with which an agent has about as many parameters as the agent `gru` with `recurrence.hidden_size`.
+
+    Args:
+        settings: Settings of the agent, with `recurrence.match_gru`.
+        shapes: Shapes of one environment's observation, by key.
+        branches: Number of choices of each branch of the action.
+        ground_truth: Entries of the environment's ground truth; 0 if it has none.
+
+    Returns:
+        A multiple of 4, so that it can be divided among heads.
+
+    Raises:
+        ValueError: No such size has the number of parameters up to 5 %.
+    """
+    given = settings.recurrence.hidden_size
+
+    def count(changed: Settings, size: int) -> int:
+        recurrence = dataclasses.replace(changed.recurrence, hidden_size=size, match_gru=False)
+        with torch.device("meta"):
+            made = Agent(dataclasses.replace(changed, recurrence=recurrence), shapes, branches, ground_truth, "meta")
+        return made.num_parameters
+
+    wanted = count(dataclasses.replace(settings, agent="gru", agent_option=()), given)
+    low, high = 1, 2
+    while count(settings, 4 * high) < wanted:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if count(settings, 4 * middle) < wanted else (low, middle)
+    counts = {4 * size: count(settings, 4 * size) for size in (low, high)}
+    size = min(counts, key=lambda size: abs(counts[size] - wanted))
+    if abs(counts[size] - wanted) > 0.05 * wanted:
+        raise ValueError(
+            f"--recurrence.match-gru: {settings.agent_name} has {counts[size]} parameters with the closest hidden size {size}, "
+            f"the agent gru with {given} has {wanted}; choose a larger --recurrence.hidden-size"
+        )
+    return size
+
+
 def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu") -> Agent:
     """Make an agent with newly initialised weights for an environment.
 
@@ -450,7 +494,8 @@ def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu
         device: Device of the weights and the memories.
 
     Raises:
-        ValueError: The settings need frames or a ground truth that the environment does not have.
+        ValueError: The settings need frames or a ground truth that the environment does not have, or the observation is not made
+            of frames and vectors.
     """
     observation = settings.environment.observation
     space = spec.observation_space(Frames() if observation == "rgb" else None, observation == "features")
@@ -458,5 +503,11 @@ def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu
         space = wrappers.observation_space(settings)
     if not isinstance(space, spaces.Dict):
         space = spaces.Dict({FRAME if observation == "rgb" else "features": space})
-    shapes = {key: tuple(part.shape or ()) for key, part in space.items()}
+    for key, part in space.items():
+        if not isinstance(part, spaces.Box):
+            raise ValueError(
+                f"observations must be frames and vectors, got {part} in `{key}`; make them vectors, in environments of POPGym "
+                "by --environment.wrapper endless_gym_agents.popgym:Vectors"
+            )
+    shapes = {key: part.shape or () for key, part in space.items()}
     return Agent(settings, shapes, spec.branches, spec.ground_truth, device)

@@ -78,6 +78,9 @@ class Recurrence:
 
     hidden_size: Positive = 512
     """size of the hidden state"""
+    match_gru: bool = False
+    """choose the hidden size so that the agent has as many parameters, up to 5 %, as the agent gru with `hidden-size` and the
+    same other settings: for comparisons of memories. Not for transformers and baselines"""
     layers: Positive = 1
     """number of stacked recurrent layers"""
     residual: bool = False
@@ -315,6 +318,8 @@ class Settings:
         if self.agent_options() and not self.agent_class:
             classes = ", ".join(MEMORIES)
             raise ValueError(f"--agent-option is for {classes} and agents of your own, got --agent {self.agent}")
+        if self.recurrence.match_gru and not (self.agent_class or self.agent in ("gru", "lstm")):
+            raise ValueError(f"--recurrence.match-gru is for recurrent memories, got --agent {self.agent}")
         if self.encoder:
             own.load("--encoder", self.encoder, nn.Module)
         elif self.encoder_options():

@@ -1,0 +1,36 @@
+"""POPGym's observations as vectors for the agents: `--environment.wrapper endless_gym_agents.popgym:Vectors`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from endless_gym.popgym import PreviousAction
+
+
+class Vectors(PreviousAction):
+    """Observation, previous action and whether a step is the first of its episode, as POPGym's agents observe them, as float32
+    vectors in which integers are one-hot.
+    """
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(envs, flatten=True)
+        entries = self.single_observation_space.shape or ()
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, entries, np.float32)
+        self.observation_space = batch_space(self.single_observation_space, envs.num_envs)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The previous actions, and the environments whose episode has ended, for a checkpoint."""
+        return {"actions": self._actions, "ended": self._ended}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load what `state_dict` returned."""
+        self._actions, self._ended = state["actions"].copy(), state["ended"].copy()
+
+    def _joined(self, observation: Any, actions: NDArray[Any], first: NDArray[np.int64]) -> Any:
+        return super()._joined(observation, actions, first).astype(np.float32)
