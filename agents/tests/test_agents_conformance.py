@@ -1,5 +1,6 @@
 """The checks of a memory: all memories of the package pass them, and memories with mistakes do not."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -19,6 +20,13 @@ def test_the_memories_of_the_package_pass(name: str) -> None:
     names = {result.name for result in results}
     assert names >= {"agreement", "reset", "size", "leak", "finite"}
     assert ("gradient" in names) == ("trxl" not in name)
+
+
+def test_the_memory_of_the_documentation_passes(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "train" / "memories.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "average.py").write_text(block)
+    assert all(result.passed for result in conformance.check(f"{tmp_path}/average.py:Average"))
 
 
 MISTAKES = '''
