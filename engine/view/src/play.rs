@@ -3,7 +3,7 @@
 use std::sync::atomic::AtomicBool;
 
 use axum::Router;
-use axum::http::{Method, StatusCode, Uri};
+use axum::http::{HeaderMap, Method, StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
 use form_urlencoded::Serializer;
 use serde_json::{Map, Value as Json};
@@ -41,7 +41,7 @@ impl PlayServer {
     /// [`ViewError::PageNotBuilt`] if this program was built without the page, [`ViewError::NotOnPage`] if its page does not have the
     /// environment, and [`ViewError::Port`] if the port is taken.
     pub fn bind(port: u16, id: &str) -> Result<Self, ViewError> {
-        check(endless_gym_page::engine(), id)?;
+        check(endless_gym_page::engine().as_deref(), id)?;
         Ok(PlayServer { port: Port::local(port)? })
     }
 
@@ -66,19 +66,20 @@ fn check(engine: Option<&[u8]>, id: &str) -> Result<(), ViewError> {
     is_on_page.then_some(()).ok_or_else(|| ViewError::NotOnPage { id: id.to_owned() })
 }
 
-async fn answer(method: Method, address: Uri) -> Response {
+async fn answer(method: Method, headers: HeaderMap, address: Uri) -> Response {
     if !matches!(method, Method::GET | Method::HEAD) {
         return (StatusCode::METHOD_NOT_ALLOWED, "the page is read with GET\n").into_response();
     }
     match address.path() {
-        "/" => found("index.html"),
+        "/" => found(&headers, "index.html"),
         "/worker.js" => server::file("worker.js", WORKER.as_bytes()),
-        path => found(path.strip_prefix('/').unwrap_or_default()),
+        path => found(&headers, path.strip_prefix('/').unwrap_or_default()),
     }
 }
 
-fn found(name: &str) -> Response {
-    endless_gym_page::file(name).map_or_else(server::not_found, |bytes| server::file(name, bytes))
+fn found(headers: &HeaderMap, name: &str) -> Response {
+    let file = endless_gym_page::file(name);
+    file.map_or_else(server::not_found, |bytes| server::compressed(headers, name, bytes))
 }
 
 /// The part after `#` in the address of an episode, as the page's `link.js` reads it. Reset parameters are JSON, but
@@ -98,13 +99,39 @@ fn link(id: &str, options: &Map<String, Json>, seed: Option<u64>) -> String {
 
 #[cfg(test)]
 mod tests {
+    use axum::http::header::ACCEPT_ENCODING;
     use serde_json::json;
 
     use super::*;
 
     fn answered(method: Method, path: &str) -> Response {
+        asked(method, HeaderMap::new(), path)
+    }
+
+    fn asked(method: Method, headers: HeaderMap, path: &str) -> Response {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        runtime.block_on(answer(method, path.parse().unwrap()))
+        runtime.block_on(answer(method, headers, path.parse().unwrap()))
+    }
+
+    fn body(response: Response) -> Vec<u8> {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        runtime.block_on(axum::body::to_bytes(response.into_body(), usize::MAX)).unwrap().to_vec()
+    }
+
+    #[test]
+    fn files_are_sent_compressed_to_clients_that_take_it() {
+        for (accepted, is_compressed) in
+            [("gzip, deflate, br", true), ("deflate,gzip", true), ("gzip;q=0", false), ("identity", false)]
+        {
+            let headers = HeaderMap::from_iter([(ACCEPT_ENCODING, accepted.parse().unwrap())]);
+            let response = asked(Method::GET, headers, "/style.css");
+            assert_eq!(response.headers()["content-type"], "text/css; charset=utf-8");
+            assert_eq!(response.headers().get("content-encoding").is_some(), is_compressed, "{accepted}");
+            let plain = body(answered(Method::GET, "/style.css"));
+            let sent = body(response);
+            assert!(plain.starts_with(b"/*"));
+            assert!(if is_compressed { sent.len() < plain.len() / 2 } else { sent == plain }, "{accepted}");
+        }
     }
 
     #[test]

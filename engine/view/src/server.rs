@@ -11,7 +11,10 @@ use std::time::Duration;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::Request;
-use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE, HOST, ORIGIN, REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS};
+use axum::http::header::{
+    ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_TYPE, HOST, ORIGIN, REFERRER_POLICY,
+    X_CONTENT_TYPE_OPTIONS,
+};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
@@ -181,6 +184,16 @@ fn protected(mut response: Response) -> Response {
 /// Answers with a file.
 pub(crate) fn file(name: &str, bytes: &'static [u8]) -> Response {
     ([(CONTENT_TYPE, HeaderValue::from_static(content_type(name)))], Body::from(bytes)).into_response()
+}
+
+/// Answers with a file that is compressed with gzip, and sends it so to clients that take it.
+pub(crate) fn compressed(headers: &HeaderMap, name: &str, bytes: &'static [u8]) -> Response {
+    let accepted = headers.get(ACCEPT_ENCODING).and_then(|value| value.to_str().ok()).unwrap_or_default();
+    let content_type = [(CONTENT_TYPE, content_type(name))];
+    if accepted.split(',').any(|encoding| encoding.trim() == "gzip") {
+        return (content_type, [(CONTENT_ENCODING, "gzip")], bytes).into_response();
+    }
+    (content_type, endless_gym_page::decompress(bytes)).into_response()
 }
 
 /// The type of a file by its name.

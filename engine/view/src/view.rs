@@ -10,7 +10,7 @@ use axum::Router;
 use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
 use axum::extract::{Path, Query, Request, State};
 use axum::http::header::CONTENT_TYPE;
-use axum::http::{StatusCode, Uri};
+use axum::http::{HeaderMap, StatusCode, Uri};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
@@ -160,12 +160,12 @@ async fn index(State(shared): State<Arc<Shared>>) -> Response {
     ([(CONTENT_TYPE, "text/html; charset=utf-8")], page).into_response()
 }
 
-async fn file(address: Uri) -> Response {
+async fn file(headers: HeaderMap, address: Uri) -> Response {
     let name = address.path().rsplit('/').next().unwrap_or_default();
     if let "style.css" | "icon.svg" = name
         && let Some(bytes) = endless_gym_page::file(name)
     {
-        return server::file(name, bytes);
+        return server::compressed(&headers, name, bytes);
     }
     let found = FILES.iter().find(|(other, _)| *other == name);
     found.map_or_else(server::not_found, |(name, bytes)| server::file(name, bytes))
