@@ -35,6 +35,8 @@ const BROWSER: Need = Need {
     what: "Chromium; apt-get install chromium, or set CHROMIUM to the program's path",
 };
 
+const NPM: Need = Need { is_met: || succeeds(Command::new("npm").arg("--version")), what: "npm; apt-get install npm" };
+
 const fn step(name: &'static str, rest: bool, needs: &'static [Need], run: fn() -> Result<(), String>) -> Step {
     Step { name, rest, run, needs }
 }
@@ -51,7 +53,7 @@ const STEPS: &[Step] = &[
     step("faults", true, &[], rust::test_faults),
     step("instructions", true, &[VALGRIND], || rust::instructions(false)),
     step("loom", true, &[], rust::loom),
-    step("browser", true, &[WASM, BROWSER], web::test),
+    step("browser", true, &[WASM, BROWSER, NPM], web::test),
     step("documentation", true, &[], || docs::build(false)),
     step("rust-original", true, &[ORIGINAL_PYTHON], || rust::test_original(None)),
     step("python-original", true, &[ORIGINAL_PYTHON], python::test_original),

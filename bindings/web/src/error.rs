@@ -34,6 +34,8 @@ pub enum WebError {
     ScriptIsOver,
     #[error("a wall must have at least one environment and one column")]
     EmptyWall,
+    #[error("the wall has no environment at this place")]
+    NoTile,
     #[error("`{id}` has no frames, which a wall shows; play it alone")]
     NoFrame { id: &'static str },
     #[error(transparent)]

@@ -211,8 +211,6 @@ impl Game {
         let done = batch.has_ended(0);
         let columns = self.pool.spec().info.iter().zip(batch.info());
         let info: Map<String, Json> = columns.map(|(column, value)| (column.name.to_owned(), json!(value))).collect();
-        let options: Map<String, Json> =
-            self.options.iter().map(|(name, value)| (name.clone(), value.to_string().into())).collect();
         let recording = self.script.as_ref().map(|(trace, number)| {
             let steps = trace.episodes[*number].steps.len();
             let over = self.length() >= steps && number + 1 == trace.episodes.len();
@@ -220,7 +218,7 @@ impl Game {
         });
         Ok(json!({
             "id": self.pool.spec().id,
-            "options": options,
+            "options": texts(&self.options),
             // As text, since JavaScript numbers cannot hold 64-bit integers.
             "seed": self.seed.map(|seed| seed.to_string()),
             "length": self.length(),
@@ -237,4 +235,9 @@ impl Game {
             "recording": recording,
         }))
     }
+}
+
+/// Reset parameters as the texts of the page's form.
+pub fn texts(options: &OptionMap) -> Map<String, Json> {
+    options.iter().map(|(name, value)| (name.clone(), value.to_string().into())).collect()
 }

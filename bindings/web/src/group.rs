@@ -2,13 +2,17 @@
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::pool::{
-    Experts, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads,
+    Experts, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, RunningEpisode, Seeding, Threads,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::FrameShape;
 use serde_json::{Value as Json, json};
 
 use crate::error::WebError;
+use crate::game::texts;
+
+/// The seeds of the episodes are below this; those of the paper's training.
+const SEEDS: u64 = 100_000;
 
 enum Policy {
     Experts(Experts),
@@ -40,7 +44,8 @@ impl Group {
         let shape = spec.frame.ok_or(WebError::NoFrame { id: spec.id })?;
         let config = PoolConfig {
             options: ResetOptions::Shared(options),
-            seeding: Seeding::Continue { seed: Some(seed) },
+            // Each episode has a seed of its own, so that it can be played alone.
+            seeding: Seeding::Range { start: 0, end: SEEDS, step: 1, seed: Some(seed) },
             features: expert,
             ..PoolConfig::new(id, num_envs)
         };
@@ -81,6 +86,16 @@ impl Group {
     pub fn observations(&self) -> impl Iterator<Item = (&[u8], FrameShape)> {
         let observations = Batch::new(self.pool.layout(), &self.blocks).observation();
         observations.chunks_exact(self.shape.bytes()).map(|observation| (observation, self.shape))
+    }
+
+    /// The episode that an environment plays.
+    pub fn episode(&self, env: usize) -> Result<Json, WebError> {
+        let RunningEpisode { seed, options, .. } = self.pool.running_episode(env)?;
+        Ok(json!({
+            "id": self.pool.spec().id,
+            "seed": seed.map(|seed| seed.to_string()),
+            "options": texts(&options),
+        }))
     }
 
     pub fn shape(&self) -> FrameShape {

@@ -61,6 +61,10 @@ pub enum Request {
         expert: bool,
         seed: String,
     },
+    /// The episode that an environment of the wall plays: its id, seed and reset parameters.
+    Tile {
+        place: usize,
+    },
 }
 
 #[derive(Deserialize)]
@@ -105,6 +109,9 @@ impl Request {
                 };
                 let groups = groups.iter().map(make).collect::<Result<_, _>>()?;
                 return Ok(Reply::Json(app.wall.insert(Wall::new(groups, columns)?).state()));
+            }
+            Request::Tile { place } => {
+                return Ok(Reply::Json(app.wall.as_ref().ok_or(WebError::NoWall)?.episode(place)?));
             }
             Request::Step { action } => Player::Person(action),
             Request::StepOfExpert => Player::Expert,

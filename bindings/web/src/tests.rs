@@ -130,6 +130,30 @@ fn a_wall_plays_all_environments_at_once() {
     }
 }
 
+#[test]
+fn the_episode_of_a_tile_is_played_alone() {
+    environments();
+    for spec in memory_gym().specs() {
+        let groups = json!([
+            {"id": "MysteryPath-v0", "num_envs": 2, "options": {}},
+            {"id": spec.id, "num_envs": 3, "options": {"agent_scale": "0.3"}}
+        ]);
+        request(&json!({"wall": {"groups": groups, "columns": 2, "expert": false, "seed": "3"}})).unwrap();
+        let tile = request(&json!({"tile": {"place": 4}})).unwrap();
+        assert_eq!((&tile["id"], &tile["options"]), (&json!(spec.id), &json!({"agent_scale": "0.3"})));
+        request(&json!({"start": tile})).unwrap();
+        // The frame of the first step shows the same episode: the wall's is at row 2, column 0.
+        let same = APP.with_borrow_mut(|app| {
+            let wall = app.wall.as_mut().unwrap().draw();
+            let game = app.game.as_ref().unwrap().observation();
+            let row = |y: usize| &wall[(2 * (SCREEN + 4) + y) * (2 * SCREEN + 4) * 4..][..SCREEN * 4];
+            (0..SCREEN).all(|y| *row(y) == game[y * SCREEN * 4..][..SCREEN * 4])
+        });
+        assert!(same, "{}", spec.id);
+        assert!(request(&json!({"tile": {"place": 5}})).unwrap_err().starts_with("the wall has no environment"));
+    }
+}
+
 #[path = "../tests/own/lib.rs"]
 mod own;
 

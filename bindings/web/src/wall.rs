@@ -46,6 +46,18 @@ impl Wall {
         (0..count).try_for_each(|_| self.groups.iter_mut().try_for_each(Group::step))
     }
 
+    /// The episode that the environment at a place of the picture plays.
+    pub fn episode(&self, mut place: usize) -> Result<Json, WebError> {
+        for group in &self.groups {
+            let count = group.observations().count();
+            if place < count {
+                return group.episode(place);
+            }
+            place -= count;
+        }
+        Err(WebError::NoTile)
+    }
+
     /// The picture, RGBA.
     pub fn draw(&mut self) -> &[u8] {
         let stride = self.width();

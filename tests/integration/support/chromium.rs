@@ -106,19 +106,42 @@ impl Chromium {
         self.key("keyUp", code);
     }
 
+    /// Presses Enter as a keyboard does, which also submits a form or changes a field.
+    pub fn enter(&mut self) {
+        for kind in ["keyDown", "keyUp"] {
+            let event =
+                json!({"type": kind, "code": "Enter", "key": "Enter", "text": "\r", "windowsVirtualKeyCode": 13});
+            self.call("Input.dispatchKeyEvent", &event);
+        }
+    }
+
     /// Sends a `rawKeyDown` or `keyUp`.
     pub fn key(&mut self, kind: &str, code: &str) {
         self.call("Input.dispatchKeyEvent", &json!({"type": kind, "code": code, "key": code}));
     }
 
-    /// Sends a `touchStart` or `touchEnd` in the middle of an element.
-    pub fn touch(&mut self, kind: &str, selector: &str) {
-        let middle = format!(
-            "(() => {{ const e = document.querySelector({}); e.scrollIntoView({{block: 'center', behavior: 'instant'}}); \
+    /// The middle of an element, which it scrolls into view if it is not.
+    fn middle(&mut self, selector: &str) -> Json {
+        self.value(&format!(
+            "(() => {{ const e = document.querySelector({}); e.scrollIntoView({{block: 'nearest', behavior: 'instant'}}); \
              const b = e.getBoundingClientRect(); return {{x: b.x + b.width / 2, y: b.y + b.height / 2}} }})()",
             json!(selector)
-        );
-        let point = self.value(&middle);
+        ))
+    }
+
+    /// Clicks the middle of an element with the mouse.
+    pub fn click(&mut self, selector: &str) {
+        let mut event = self.middle(selector);
+        (event["button"], event["clickCount"]) = (json!("left"), json!(1));
+        for kind in ["mousePressed", "mouseReleased"] {
+            event["type"] = json!(kind);
+            self.call("Input.dispatchMouseEvent", &event);
+        }
+    }
+
+    /// Sends a `touchStart` or `touchEnd` in the middle of an element.
+    pub fn touch(&mut self, kind: &str, selector: &str) {
+        let point = self.middle(selector);
         let points = if kind == "touchStart" { json!([point]) } else { json!([]) };
         self.call("Input.dispatchTouchEvent", &json!({"type": kind, "touchPoints": points}));
     }

@@ -2,22 +2,35 @@
 
 import { Engine } from "./engine.js";
 import { ParameterForm } from "./form.js";
+import { isTyping } from "./keys.js";
 import { episodeLink, readLink, wallLink } from "./link.js";
 import { Play } from "./play.js";
 import { Wall } from "./wall.js";
 
 const $ = (id) => document.getElementById(id);
 
-function say(text, isNote = false) {
-  $("message").textContent = text;
-  $("message").classList.toggle("note", isNote);
-  $("message").hidden = text === "";
+/** Says something beside the control that it is about, over the page; an empty text takes it away. */
+function say(text, near = "pause", isNote = false) {
+  const box = $("message");
+  box.classList.toggle("note", isNote);
+  box.hidden = text === "";
+  box.textContent = text;
+  if (text === "") return;
+  const place = ($(near).checkVisibility() ? $(near) : $("environment")).getBoundingClientRect();
+  const [width, height] = [document.documentElement.clientWidth, document.documentElement.clientHeight];
+  const below = place.bottom + 4;
+  const top = below + box.offsetHeight <= height ? below : Math.max(4, place.top - box.offsetHeight - 4);
+  box.style.left = `${Math.max(8, Math.min(place.left, width - box.offsetWidth - 8)) + scrollX}px`;
+  box.style.top = `${top + scrollY}px`;
 }
 
 const report = (error) => say(error.message);
 
 /** One of the paper's training seeds. */
 const randomSeed = () => String(crypto.getRandomValues(new Uint32Array(1))[0] % 100_000);
+
+/** The wall that the page shows unless the address names another. */
+const WALL = { wall: "all", count: "100", by: "expert" };
 
 class App {
   constructor(engine) {
@@ -28,8 +41,8 @@ class App {
     this.play = new Play(engine, this.specs, { changed: (state) => this.#playing(state), report });
     this.wall = new Wall(engine, this.specs, {
       changed: (wall) => this.#address(wallLink(wall)),
-      play: (id) => this.start({ id, options: {}, seed: randomSeed() }),
-      report,
+      play: (episode) => this.start(episode),
+      report: (error) => this.#noWall(error),
     });
     this.#environments();
     $("to-wall").disabled = this.specs.every((spec) => !spec.frame);
@@ -45,18 +58,18 @@ class App {
     this.start(episode);
     if (!$("message").hidden) return;
     if (link.by === "agent") this.play.playAgent(episode);
-    else if (link.by === "expert") this.play.toggleExpert();
-    else if (link.by) say(`by must be agent or expert, got \`${link.by}\``);
+    else if (link.by === "expert") this.play.choose("expert");
+    else if (link.by) say(`by must be agent or expert, got \`${link.by}\``, "person");
   }
 
   /** Starts an episode, or reports why it cannot. */
-  start(episode) {
+  start(episode, near = "environment") {
     this.#view("play");
     say("");
     try {
       this.play.start(episode);
     } catch (error) {
-      report(error);
+      say(error.message, near);
       if (!this.play.state) this.play.start({ id: this.first, options: {}, seed: randomSeed() });
     }
   }
@@ -65,8 +78,16 @@ class App {
     this.#view("wall");
     say("");
     this.#allOption(true);
-    this.wall.start(link);
-    if (this.wall.id) $("environment").value = this.wall.id;
+    $("environment").value = link.wall;
+    // The wall that an episode was chosen from goes on.
+    if (this.wall.link && wallLink(this.wall.link) === location.hash) this.wall.resume();
+    else this.wall.start(link);
+  }
+
+  /** Says why there is no wall, and shows another one if there is none. */
+  #noWall(error) {
+    if (!this.wall.state) this.showWall(WALL);
+    say(error.message, "environment");
   }
 
   #environments() {
@@ -100,39 +121,42 @@ class App {
     $("seed").value = state.seed ?? "";
     document.title = `${state.id} – Endless Gym`;
     this.form.show(this.play.spec, state.options);
-    if (Object.keys(state.options).length > 0) $("parameters").open = true;
     const by = ["agent", "expert"].find((player) => player === this.play.player);
     this.#address(episodeLink({ ...state, seed: state.seed ?? "0", by }));
   }
 
+  /** Sets the address. Back leads from an episode to the wall before it, or the reverse, and not from one seed to another. */
   #address(hash) {
-    if (location.hash !== hash) history.replaceState(null, "", hash);
+    const isWall = (address) => readLink(address).wall !== undefined;
+    if (location.hash === hash) return;
+    if (location.hash !== "" && isWall(hash) !== isWall(location.hash)) history.pushState(null, "", hash);
+    else history.replaceState(null, "", hash);
   }
 
   #listen() {
     addEventListener("hashchange", () => this.follow());
     $("to-play").addEventListener("click", () => {
-      const id = this.wall.id && this.wall.id !== "all" ? this.wall.id : this.play.state?.id ?? this.first;
+      const shown = this.wall.link?.wall;
+      const id = shown && shown !== "all" ? shown : this.play.state?.id ?? this.first;
       if (this.play.state?.id !== id) return this.start({ id, options: {}, seed: randomSeed() });
       this.#view("play");
       this.#playing(this.play.state);
     });
-    $("to-wall").addEventListener("click", () => this.showWall({ wall: "all", count: "100", by: "expert" }));
+    $("to-wall").addEventListener("click", () => this.showWall(WALL));
     $("environment").addEventListener("change", () => {
       const id = $("environment").value;
       if (this.play.active) this.start({ id, options: {}, seed: $("seed").value || randomSeed() });
       else this.wall.start({ wall: id, count: $("wall-count").value, by: $("wall-by").value });
-      // Frees the arrow keys for playing.
-      $("environment").blur();
     });
-    $("seed").addEventListener("change", () => this.#restart());
+    $("seed").addEventListener("change", () => this.#restart("seed"));
     $("form").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.#restart();
+      this.#restart("submit");
     });
+    this.#giveKeysBack();
     $("defaults").addEventListener("click", () => {
       this.form.show(this.play.spec, {});
-      this.#restart();
+      this.#restart("defaults");
     });
     $("save").addEventListener("click", () => this.#save());
     $("open").addEventListener("click", () => $("file").click());
@@ -150,9 +174,23 @@ class App {
     });
   }
 
-  #restart() {
+  /** Gives the keys back to the game after a control was used: by the pointer, or the keyboard for what starts or ends something. */
+  #giveKeysBack() {
+    const give = () => this.play.active && $("observation").focus({ preventScroll: true });
+    addEventListener("click", ({ target, detail }) => {
+      if (target.closest("#play, header") && (detail > 0 || target.closest("button")) && !isTyping(target) && !target.matches("select, label")) give();
+    });
+    addEventListener("change", ({ target }) => target.matches("select, #seed, #pace") && give());
+    addEventListener("keydown", ({ target, code }) => {
+      if (code === "Escape") say("");
+      if ((code === "Enter" || code === "Escape") && target.matches("#seed, #pace")) give();
+    });
+    addEventListener("pointerdown", ({ target }) => target !== $("message") && say(""));
+  }
+
+  #restart(near) {
     const seed = $("seed").value;
-    this.start({ id: $("environment").value, options: this.form.options(), seed });
+    this.start({ id: $("environment").value, options: this.form.options(), seed }, near);
     // Keep what was typed, even if the engine rejects it.
     if (!$("message").hidden) $("seed").value = seed;
   }
@@ -162,7 +200,7 @@ class App {
     const url = URL.createObjectURL(new Blob([bytes], { type: "application/gzip" }));
     Object.assign(document.createElement("a"), { href: url, download: name }).click();
     setTimeout(() => URL.revokeObjectURL(url), 10_000);
-    say(`Saved as ${name}; \`endless verify ${name}\` replays it.`, true);
+    say(`Saved as ${name}; \`endless verify ${name}\` replays it.`, "save", true);
   }
 
   async #open(file) {
@@ -172,18 +210,18 @@ class App {
       const { episodes, steps, differences, first } = this.play.open(new Uint8Array(await file.arrayBuffer()));
       this.#view("play");
       const verdict = differences === 0 ? "replayed without a difference" : `${differences} differences, the first in ${first}`;
-      say(`${file.name}: ${count(episodes, "episode")}, ${count(steps, "step")}, ${verdict}.`, differences === 0);
+      say(`${file.name}: ${count(episodes, "episode")}, ${count(steps, "step")}, ${verdict}.`, "open", differences === 0);
     } catch (error) {
-      say(`${file.name}: ${error.message}`);
+      say(`${file.name}: ${error.message}`, "open");
     }
   }
 
   async #copy() {
     try {
       await navigator.clipboard.writeText(location.href);
-      say("The link to this episode is in the clipboard.", true);
+      say("The link to this episode is in the clipboard.", "copy", true);
     } catch {
-      say(`The browser refuses access to the clipboard; the link is ${location.href}`);
+      say(`The browser refuses access to the clipboard; the link is ${location.href}`, "copy");
     }
   }
 }
@@ -213,9 +251,11 @@ try {
   // For tests and for the browser's console.
   globalThis.endless = app;
   app.follow();
+  $("play").ariaBusy = "false";
   // For measurements: milliseconds from the start of navigation to the frame after the first picture.
   requestAnimationFrame((now) => (app.firstFrame = now));
 } catch (error) {
+  $("overlay").hidden = true;
   report(error);
 }
 

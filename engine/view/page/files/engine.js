@@ -13,13 +13,19 @@ export class Engine {
   static async load(url = new URL("engine.wasm", import.meta.url)) {
     const response = await fetch(url);
     if (!response.ok) throw new EngineError(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
-    const { instance } = await WebAssembly.instantiate(await response.arrayBuffer());
-    const engine = new Engine(instance.exports);
-    engine.#reply(() => instance.exports.environments());
+    return Engine.of(await WebAssembly.compile(await response.arrayBuffer()));
+  }
+
+  /** An engine of its own from compiled code, which a worker can share. */
+  static async of(module) {
+    const { exports } = await WebAssembly.instantiate(module);
+    const engine = new Engine(module, exports);
+    engine.#reply(() => exports.environments());
     return engine;
   }
 
-  constructor(wasm) {
+  constructor(module, wasm) {
+    this.module = module;
     this.#wasm = wasm;
   }
 

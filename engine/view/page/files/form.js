@@ -1,5 +1,16 @@
 // The reset parameters as a form, made from the engine's table.
 
+/** The groups of the parameters, each with a pattern of their names; the first that matches counts. */
+const GROUPS = [
+  ["Rewards", /^reward_/],
+  ["Agent", /^(agent_|sample_agent)/],
+  ["Spotlights", /spawn|^spot_/],
+  ["Coins and exit", /coin|exit/],
+  ["Commands", /command|explosion/],
+  ["Picture", /^show_|visual|light|background|chessboard|camera/],
+  ["Task", /./],
+];
+
 /** Creates the fields of an environment in `place`. `check(options)` throws the engine's error. */
 export class ParameterForm {
   #fields = new Map();
@@ -12,7 +23,17 @@ export class ParameterForm {
   /** Shows the parameters of `spec` with the given texts, and defaults for the rest. */
   show(spec, options) {
     this.#fields.clear();
-    this.place.replaceChildren(...spec.parameters.map((parameter) => this.#field(parameter, options[parameter.name])));
+    const groups = new Map(GROUPS.map(([name]) => [name, []]).reverse());
+    for (const parameter of spec.parameters) {
+      const [name] = GROUPS.find(([, pattern]) => pattern.test(parameter.name));
+      groups.get(name).push(this.#field(parameter, options[parameter.name]));
+    }
+    const shown = [...groups].filter(([, fields]) => fields.length > 0);
+    this.place.replaceChildren(...shown.map(([name, fields]) => {
+      const group = document.createElement("fieldset");
+      group.append(Object.assign(document.createElement("legend"), { textContent: name }), ...fields);
+      return group;
+    }));
     this.validate();
   }
 

@@ -5,9 +5,12 @@ const KEYS = {
   KeyA: "left", KeyD: "right", KeyW: "up", KeyS: "down",
 };
 
-/** Whether a control of the page receives the keys. */
+/** Fields for text, and controls that the keyboard has reached and whose value the arrows change. */
+const TYPING = "input:not([type=checkbox], [type=range]), textarea, :is(select, [type=range]):focus-visible";
+
+/** Whether a control of the page receives the keys; otherwise, they belong to the game. */
 export function isTyping(target) {
-  return target instanceof Element && target.matches("input, select, textarea");
+  return target instanceof Element && target.matches(TYPING);
 }
 
 /** The held directions, and those pressed since the last step, so that none is lost at a slow pace. */

@@ -9,7 +9,7 @@ export function readLink(hash) {
     return value;
   };
   const wall = take("wall");
-  if (wall !== null) return { wall, count: take("count"), by: take("by") };
+  if (wall !== null) return { wall, count: take("count"), by: take("by"), options: Object.fromEntries(fields) };
   const id = take("env");
   const seed = take("seed");
   const by = take("by");
@@ -22,6 +22,6 @@ export function episodeLink({ id, seed, options, by }) {
 }
 
 /** The address of a wall. */
-export function wallLink({ wall, count, by }) {
-  return "#" + new URLSearchParams({ wall, count, by });
+export function wallLink({ wall, count, by, options }) {
+  return "#" + new URLSearchParams({ wall, count, by, ...options });
 }

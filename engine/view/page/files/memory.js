@@ -4,9 +4,9 @@ import { arrowOf, outcomeOf } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 
-/** Lists the commands that an episode has shown, and marks the finished ones and the next one. */
-export function showMemory(state, agents) {
-  const { clues } = state;
+/** Lists the commands that an episode of an agent has shown, and marks the finished ones and the next one. */
+export function showMemory(state, agents, isAgent) {
+  const clues = isAgent ? state.clues : [];
   const done = state.progress.find(({ name }) => name === "commands")?.value ?? 0;
   const outcome = outcomeOf(state);
   const kind = (place) => {
@@ -27,8 +27,8 @@ export function showMemory(state, agents) {
     return item;
   }));
   $("no-clues").hidden = clues.length > 0;
+  $("no-clues").textContent = isAgent ? "Nothing was shown yet." : "Here appear the commands while the agent plays.";
   const { episodes, successes } = agents.counted(state);
-  const count = episodes === 0 ? "No episode has ended yet." : `Successes: ${successes} of ${episodes}.`;
-  $("successes").textContent = count;
-  $("trained").textContent = agents.trained(state.id);
+  $("successes").textContent = episodes === 0 ? "" : `Successes: ${successes} of ${episodes}.`;
+  $("trained").textContent = agents.description(state.id) ? agents.trained(state.id) : "";
 }

@@ -4,10 +4,11 @@ import { Agents } from "./agents.js";
 import { ActionControls } from "./controls.js";
 import { flash } from "./flash.js";
 import { Directions, isTyping } from "./keys.js";
+import { live } from "./live.js";
 import { showMemory } from "./memory.js";
 import { Pace } from "./pace.js";
 import { enable, tone } from "./sound.js";
-import { actionFor, actionText, choiceName, commandsOf, outcomeOf, steering, TASKS, waits } from "./tasks.js";
+import { actionFor, actionText, choiceName, commandsOf, legendOf, outcomeOf, steering, TASKS, waits } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 
@@ -21,7 +22,6 @@ const BREAK = 2500;
 // A phone has no keys.
 const TOUCH = matchMedia("(pointer: coarse)").matches;
 const GO = TOUCH ? "A tap" : "Space";
-const AGAIN = TOUCH ? "" : "Enter: next seed. R: again.";
 
 export class Play {
   /** Calls `changed(episode)` when an episode starts, and `report(error)` with the engine's errors. */
@@ -32,7 +32,10 @@ export class Play {
     this.report = report;
     this.state = null;
     this.player = "person";
+    /** The reset parameters before an agent played with those of its training. */
+    this.before = null;
     this.agents = new Agents(engine);
+    this.say = live($("status"));
     this.directions = new Directions(() => this.#takeOver());
     this.directions.attach($("pad"));
     this.controls = new ActionControls($("action"));
@@ -49,32 +52,41 @@ export class Play {
   start({ id, options, seed }, player = "person") {
     const state = this.engine.request({ start: { id, options, seed } });
     this.player = player;
+    if (player !== "agent") this.before = null;
     this.#begin(state);
     if (player === "expert" || player === "agent") this.play();
   }
 
   /** Loads the agent of an environment and lets it play. Reset parameters default to those of its training. */
   async playAgent({ id, options, seed }) {
-    const before = this.state;
+    const { state } = this;
     try {
       await this.agents.load(id);
     } catch (error) {
       return this.report(error);
     }
     // The user may have started another episode meanwhile.
-    if (this.state !== before) return;
+    if (this.state !== state) return;
+    this.before = options;
     this.#attempt(() => this.start({ id, options: { ...this.agents.options(id), ...options }, seed }, "agent"));
   }
 
-  /** Starts or stops the trained agent. */
-  toggleAgent() {
-    if (!this.state || !this.agents.has(this.state.id)) return;
-    if (this.player === "agent") {
-      this.player = "person";
-      this.changed(this.state);
-      return this.stop();
-    }
-    this.playAgent({ ...this.state, seed: this.state.seed ?? "0" });
+  /** Lets a person, the expert or the agent play. Expert and agent must see an episode from its start. */
+  choose(player) {
+    if (!this.state || player === this.player) return;
+    // A recording may have no seed.
+    const episode = { ...this.state, options: this.before ?? this.state.options, seed: this.state.seed ?? "0" };
+    if (player === "agent") return this.agents.has(episode.id) ? this.playAgent(episode) : undefined;
+    if (player === "expert") return this.spec.has_expert ? this.#attempt(() => this.start(episode, "expert")) : undefined;
+    if (this.before) return this.#attempt(() => this.start(episode));
+    this.player = "person";
+    this.changed(this.state);
+    this.stop();
+  }
+
+  /** The reset parameters of the same player's next episode: unless it is the agent, those from before the agent. */
+  #options() {
+    return (this.player !== "agent" && this.before) || this.state.options;
   }
 
   /** Opens a trace's file. */
@@ -103,26 +115,14 @@ export class Play {
   restart() {
     if (!this.state) return;
     if (this.player === "trace") this.#attempt(() => this.open(this.file));
-    else this.#attempt(() => this.start(this.state, this.player));
+    else this.#attempt(() => this.start({ ...this.state, options: this.#options() }, this.player));
   }
 
   /** Starts the episode whose seed is larger by `by`. */
   otherSeed(by) {
     if (!this.state) return;
     const seed = BigInt.asUintN(64, BigInt(this.state.seed ?? 0) + BigInt(by)).toString();
-    this.#attempt(() => this.start({ ...this.state, seed }, this.player === "trace" ? "person" : this.player));
-  }
-
-  /** Starts or stops the expert, which must see an episode from its start. */
-  toggleExpert() {
-    if (!this.spec?.has_expert) return;
-    if (this.player === "expert") {
-      this.player = "person";
-      this.changed(this.state);
-      return this.stop();
-    }
-    // A recording may have no seed.
-    this.#attempt(() => this.start({ ...this.state, seed: this.state.seed ?? "0" }, "expert"));
+    this.#attempt(() => this.start({ ...this.state, options: this.#options(), seed }, this.player === "trace" ? "person" : this.player));
   }
 
   /** Plays one step and stops. */
@@ -149,7 +149,8 @@ export class Play {
     this.state = state;
     this.directions.clear();
     if (other) {
-      $("task").textContent = TASKS[state.id] ?? this.spec.summary;
+      $("task").firstChild.textContent = TASKS[state.id] ?? this.spec.summary;
+      this.#legend();
       this.#pad();
       this.controls.show(this.spec);
       this.#frame(this.spec.frame);
@@ -166,7 +167,7 @@ export class Play {
     for (const canvas of [$("observation"), $("view")]) Object.assign(canvas, { width, height });
     const style = document.documentElement.style;
     for (const [name, value] of Object.entries({ width, height, side: Math.max(width, height) })) style.setProperty(`--frame-${name}`, value);
-    $("view").closest("figure").hidden = !frame;
+    $("truth").hidden = !frame;
     $("observation").hidden = !frame;
     $("features").hidden = Boolean(frame);
   }
@@ -245,7 +246,8 @@ export class Play {
       showNumbers($("features"), spec.features.map(({ name }, index) => ({ name, value: state.features[index] })));
     }
     showNumbers($("numbers"), [
-      { name: "steps", value: state.length },
+      { name: "steps", value: state.length, of: state.recording?.steps },
+      { name: "action", text: state.length > 0 ? actionText(spec, state.action) : "–" },
       { name: "last reward", value: state.reward },
       { name: "return", value: state.return },
       ...state.progress,
@@ -257,43 +259,42 @@ export class Play {
     const running = this.pace.running;
     $("pause").textContent = running ? "Pause" : state.length === 0 ? "Start" : "Continue";
     $("pause").disabled = $("step").disabled = this.#over();
-    $("expert").setAttribute("aria-pressed", String(this.player === "expert"));
     $("expert").disabled = !spec.has_expert;
+    for (const player of ["person", "expert", "agent"]) $(player).setAttribute("aria-pressed", String(this.player === player));
     this.#agent();
-    $("status").textContent = this.#said(spec, state);
-    const overlay = this.#overlay();
-    $("overlay").hidden = overlay === "";
-    $("overlay").textContent = overlay;
+    $("truth").classList.toggle("covered", this.player === "person" && !this.#over() && !$("show-truth").checked);
+    this.say(this.#said(state));
+    const text = this.#text();
+    $("overlay").hidden = text === "";
+    $("said").textContent = text;
+    $("choices").hidden = !this.#over();
   }
 
   #agent() {
     const { player, state } = this;
     const reason = this.agents.reason(state.id);
     // Not `disabled`, so that the keyboard still reaches the button and a screen reader reads the reason.
-    $("agent").setAttribute("aria-pressed", String(player === "agent"));
     $("agent").setAttribute("aria-disabled", String(reason !== ""));
     $("agent").title = reason;
     $("agent-reason").textContent = reason;
-    $("memory").hidden = player !== "agent";
-    if (player === "agent") showMemory(state, this.agents);
+    // Shown before the agent plays, too, so that nothing moves when it does.
+    $("memory").hidden = reason !== "";
+    if (reason === "") showMemory(state, this.agents, player === "agent");
   }
 
-  #said(spec, state) {
-    const action = state.length > 0 ? `last action ${actionText(spec, state.action)}` : "no step yet";
-    if (this.player === "expert") return `The expert plays; ${action}. A direction key takes over.`;
-    if (this.player === "agent") return `The agent plays; ${action}. A direction key takes over.`;
-    if (this.player === "trace") {
-      const { episode, episodes, steps } = state.recording;
-      return `Recording, episode ${episode + 1} of ${episodes}, step ${state.length} of ${steps}; ${action}. A direction key takes over.`;
-    }
-    return `You play; ${action}.`;
+  #said({ recording }) {
+    const end = this.#over() ? ` ${this.#text()}` : "";
+    if (this.player === "person") return `You play.${end}`;
+    const who = { expert: "The expert plays", agent: "The agent plays" }[this.player] ?? `Recording, episode ${recording.episode + 1} of ${recording.episodes}`;
+    return end === "" ? `${who}. A direction takes over.` : `${who}.${end}`;
   }
 
-  #overlay() {
+  /** What is written on the picture. */
+  #text() {
     const { state } = this;
     if (this.#over() && state.done) {
       const success = { success: "Done", failure: "Failed", end: "Episode over" }[outcomeOf(state)];
-      return `${success}: return ${round(state.return)} in ${state.length} steps. ${AGAIN}`;
+      return `${success}: return ${round(state.return)} in ${state.length} steps.`;
     }
     if (this.#over()) return "The recording ends here.";
     if (state.length === 0 && !this.pace.running) {
@@ -302,6 +303,14 @@ export class Play {
       return `A direction starts, or ${TOUCH ? "a tap" : "Space"}.`;
     }
     return this.pace.running ? "" : `Paused. ${GO} continues.`;
+  }
+
+  #legend() {
+    $("legend").replaceChildren(...legendOf(this.state.id).map(([color, textContent]) => {
+      const item = Object.assign(document.createElement("li"), { textContent });
+      item.style.setProperty("--color", color);
+      return item;
+    }));
   }
 
   #pad() {
@@ -320,34 +329,33 @@ export class Play {
   }
 
   #listen() {
-    $("pause").addEventListener("click", () => (this.pace.running ? this.stop() : this.play()));
-    $("observation").parentElement.addEventListener("click", () => (this.pace.running ? this.stop() : this.play()));
+    const go = () => (this.pace.running ? this.stop() : this.play());
+    const tasks = { restart: () => this.restart(), next: () => this.otherSeed(1) };
+    $("pause").addEventListener("click", go);
+    $("observation").parentElement.addEventListener("click", (event) => !event.target.closest("button") && go());
+    for (const button of document.querySelectorAll("[data-do]")) button.addEventListener("click", tasks[button.dataset.do]);
+    for (const player of ["person", "expert", "agent"]) $(player).addEventListener("click", () => this.choose(player));
     $("step").addEventListener("click", () => this.oneStep());
-    $("restart").addEventListener("click", () => this.restart());
-    $("next").addEventListener("click", () => this.otherSeed(1));
-    $("expert").addEventListener("click", () => this.toggleExpert());
-    $("agent").addEventListener("click", () => this.toggleAgent());
     $("pace").addEventListener("input", () => this.setPace(Number($("pace").value)));
     $("original-pace").addEventListener("click", () => this.spec && this.#originalPace());
     $("sound").addEventListener("change", () => $("sound").checked && enable());
-    $("show-truth").addEventListener("change", (event) => {
-      event.target.closest("figure").classList.toggle("covered", !event.target.checked);
-    });
+    $("show-truth").addEventListener("change", () => this.#show());
+    const toggle = (player) => () => this.choose(this.player === player ? "person" : player);
     const keys = {
-      Space: () => (this.pace.running ? this.stop() : this.play()),
+      Space: go,
       KeyN: () => this.oneStep(),
-      KeyR: () => this.restart(),
-      KeyE: () => this.toggleExpert(),
-      KeyG: () => this.toggleAgent(),
-      Enter: () => this.otherSeed(1),
-      PageDown: () => this.otherSeed(1),
+      KeyR: tasks.restart,
+      KeyE: toggle("expert"),
+      KeyG: toggle("agent"),
+      Enter: tasks.next,
+      PageDown: tasks.next,
       PageUp: () => this.otherSeed(-1),
     };
     addEventListener("keydown", (event) => {
       const action = keys[event.code];
       if (!this.active || !action || event.ctrlKey || event.metaKey || event.altKey || isTyping(event.target)) return;
-      // Space and Enter belong to a button that has the focus.
-      const onControl = event.target instanceof Element && event.target.matches("button, summary, a");
+      // Space and Enter belong to a control that the keyboard has reached.
+      const onControl = event.target instanceof Element && event.target.matches(":is(button, summary, a, input):focus-visible");
       if (onControl && (event.code === "Space" || event.code === "Enter")) return;
       event.preventDefault();
       action();
@@ -355,21 +363,21 @@ export class Play {
   }
 }
 
-/** Shows rows `{ name, value, of }` in a list, with a bar where there is a total. */
+/** Shows rows `{ name, value, of }` or `{ name, text }` in a list, with a bar where there is a total. */
 function showNumbers(list, rows) {
   const names = rows.map((row) => row.name).join();
   if (list.dataset.names !== names) {
     list.dataset.names = names;
     list.replaceChildren(...rows.map(({ name, of }) => {
-      const item = document.createElement("div");
-      item.append(Object.assign(document.createElement("dt"), { textContent: name }), document.createElement("dd"));
-      if (of != null) item.append(Object.assign(document.createElement("progress"), { ariaLabel: name }));
+      const [item, number] = [document.createElement("div"), document.createElement("dd")];
+      number.append("", ...(of == null ? [] : [Object.assign(document.createElement("progress"), { ariaLabel: name })]));
+      item.append(Object.assign(document.createElement("dt"), { textContent: name }), number);
       return item;
     }));
   }
-  rows.forEach(({ value, of }, index) => {
-    const [, number, bar] = list.children[index].children;
-    number.textContent = of == null ? round(value) : `${round(value)} of ${round(of)}`;
+  rows.forEach(({ value, of, text }, index) => {
+    const [, { firstChild, lastElementChild: bar }] = list.children[index].children;
+    firstChild.textContent = text ?? (of == null ? round(value) : `${round(value)} of ${round(of)}`);
     if (bar) Object.assign(bar, { max: Math.max(of, 1e-9), value: Math.min(Math.max(value, 0), of) });
   });
 }

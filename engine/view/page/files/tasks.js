@@ -1,18 +1,18 @@
 // The tasks of the environments, and how each is steered.
 
-const MORTAR = "Remember the commands that are shown one after another: arrows name a neighbouring tile, a crossed circle means stay.";
-const GRID = "Left and right turn the agent, up walks to the tile ahead.";
+const MORTAR = "Remember the commands, shown one by one: an arrow means a neighbouring tile, a crossed circle stay.";
+const GRID = "Left and right turn, up walks ahead.";
 
 /** Two sentences for each id. */
 export const TASKS = {
   "MortarMayhem-v0":
-    `${MORTAR} Then carry them out in that order and be on the right tile each time the others turn red.`,
+    `${MORTAR} Then carry them out in order, on the right tile each time the others burn.`,
   "MortarMayhem-Grid-v0":
-    `${MORTAR} Then carry them out in that order; ${GRID.toLowerCase()}`,
+    `${MORTAR} Then carry them out in order; ${GRID.toLowerCase()}`,
   "MortarMayhemB-v0":
-    "Carry out the listed commands in order, from tile to tile. Be on the right tile each time the others turn red.",
+    "Carry out the commands in order, on the right tile each time the others burn.",
   "MortarMayhemB-Grid-v0":
-    `Carry out the listed commands in order and be on the right tile each time the others turn red. ${GRID}`,
+    `Carry out the commands in order, on the right tile each time the others burn. ${GRID}`,
   "Endless-MortarMayhem-v0":
     "Remember the command that is shown and carry out all commands so far, from the first; each round adds one. " +
     "The arena has no border: leaving it on one side means entering on the other.",
@@ -21,13 +21,31 @@ export const TASKS = {
   "MysteryPath-Grid-v0":
     `Find the invisible path to the goal on the opposite side and remember where a fall led back to the start. ${GRID}`,
   "Endless-MysteryPath-v0":
-    "Follow the invisible path to the right; a fall leads back to the start, and the path must then be walked from memory. " +
+    "Follow the invisible path to the right; after a fall, walk it again from memory. " +
     "A second fall at the same place, a fall before the farthest point or lost stamina ends the episode.",
   "SearingSpotlights-v0":
     "Collect the coin and leave by the exit, both hidden in the dark once the light goes off. Spotlights cost health.",
   "Endless-SearingSpotlights-v0":
     "Collect one coin after the other; each is visible for a moment only. Spotlights cost health, and time runs out without a coin.",
 };
+
+const MORTAR_COLORS = [["#00ff00", "ring: the tile to be on"], ["#701824", "burning tiles"]];
+const PATH_COLORS = [["#ffffff", "the path"], ["#0000ff", "start"], ["#00ff00", "goal"], ["#ff0000", "walls beside it"]];
+
+/** What the colours of an environment's ground-truth view mean, by the start of its id. */
+const COLORS = {
+  MortarMayhem: MORTAR_COLORS,
+  "Endless-MortarMayhem": MORTAR_COLORS,
+  MysteryPath: PATH_COLORS,
+  "Endless-MysteryPath": [["#c8c8c8", "the path"], ["#00ff00", "stamina"], ["#ff0000", "spent stamina"]],
+  SearingSpotlights: [["#ffa500", "coins"], ["#373737", "closed exit"], ["#308d46", "open exit"], ["#00ff00", "health"]],
+  "Endless-SearingSpotlights": [["#ffa500", "coin"], ["#00ff00", "health"]],
+};
+
+/** Pairs of a colour and its meaning; none where the environment's own view is unknown. */
+export function legendOf(id) {
+  return Object.entries(COLORS).find(([name]) => id.startsWith(name))?.[1] ?? [];
+}
 
 const DIRECTION_NAMES = { left: ["left"], right: ["right"], up: ["up", "ahead"], down: ["down"] };
 const DIRECTION_SIGNS = { left: "←", right: "→", up: "↑", down: "↓" };

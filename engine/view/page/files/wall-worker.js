@@ -1,0 +1,72 @@
+// The worker of the wall: its environments, which plan, step and draw without holding up the page.
+
+import { Engine } from "./engine.js";
+import { Pace } from "./pace.js";
+
+/** Milliseconds per frame that steps may take. */
+const BUDGET = 10;
+
+/** Milliseconds between two reports. */
+const INTERVAL = 500;
+
+let [engine, canvas, state, since] = [null, null, null, null];
+
+const pace = new Pace(25, (count) => {
+  try {
+    const start = performance.now();
+    let step = 0;
+    do state = engine.stepWall(1);
+    while (++step < count && performance.now() - start < BUDGET);
+    since.steps += step;
+    draw();
+  } catch (error) {
+    return fail(error);
+  }
+  const seconds = (performance.now() - since.time) / 1000;
+  if (seconds * 1000 >= INTERVAL) report(since.steps / seconds);
+});
+
+function draw() {
+  canvas.getContext("2d").putImageData(engine.wall(state.width, state.height), 0, 0);
+}
+
+/** Tells the page the state, and how often each environment stepped per second. */
+function report(rate) {
+  since = { time: performance.now(), steps: 0 };
+  postMessage({ state, rate });
+}
+
+function fail(error) {
+  pace.stop();
+  postMessage({ error: error.message });
+}
+
+const TASKS = {
+  async open({ module, surface }) {
+    [engine, canvas] = [await Engine.of(module), surface];
+  },
+  start({ request }) {
+    state = engine.request({ wall: request });
+    Object.assign(canvas, { width: state.width, height: state.height });
+    draw();
+    report(null);
+    pace.start();
+  },
+  run({ running }) {
+    since = { time: performance.now(), steps: 0 };
+    if (running) pace.start();
+    else pace.stop();
+  },
+  pace({ stepsPerSecond }) {
+    pace.stepsPerSecond = stepsPerSecond;
+  },
+  tile({ place }) {
+    postMessage({ tile: engine.request({ tile: { place } }) });
+  },
+};
+
+// One task after the other, since the first one waits for the engine.
+let before = Promise.resolve();
+addEventListener("message", ({ data }) => {
+  before = before.then(() => TASKS[data.task](data)).catch(fail);
+});
