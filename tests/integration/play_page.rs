@@ -15,7 +15,8 @@ fn the_page_opens_at_an_episode() {
         // Only release builds contain the page; `cargo xtask test --only packages` tests them.
         let output = command.output().unwrap();
         assert!(!output.status.success());
-        assert!(text(&output.stderr).contains("run `cargo xtask web`"), "{}", text(&output.stderr));
+        let stderr = text(&output.stderr);
+        assert!(stderr.contains("`--terminal`") && stderr.contains("run `cargo xtask play`"), "{stderr}");
         return;
     }
     let mut server = Server::start(command);

@@ -45,6 +45,13 @@ enum Task {
     Pictures,
     /// Build the page that plays the environments in a browser into target/web.
     Web,
+    /// Build the page and a program that includes it, and open it in a browser.
+    #[command(disable_help_flag = true)]
+    Play {
+        /// Arguments of `endless play`, such as `SearingSpotlights-v0 --seed 7`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
     /// Count the instructions of a step and compare them with the budgets.
     Instructions {
         /// Write the counts as the new budgets.
@@ -98,6 +105,7 @@ fn main() -> ExitCode {
         Task::Dist => release::build(),
         Task::Pictures => python::pictures(),
         Task::Web => web::build(),
+        Task::Play { arguments } => web::play(&arguments),
         Task::Instructions { record } => rust::instructions(record),
         Task::Bench { arguments } => python::bench(&arguments),
         Task::Faults { arguments } => rust::faults("faults", &arguments),

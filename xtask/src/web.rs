@@ -108,6 +108,12 @@ pub fn build() -> Result<(), String> {
     Ok(())
 }
 
+/// Builds the page and the program, and plays in a browser.
+pub fn play(arguments: &[String]) -> Result<(), String> {
+    build()?;
+    run(cargo(&["run", "--locked", "--release", "--bin", "endless", "--", "play", "--open"]).args(arguments))
+}
+
 /// Builds the page, and tests it, a page with environments of one's own, and the page of a running engine in a browser.
 pub fn test() -> Result<(), String> {
     build()?;

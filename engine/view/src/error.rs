@@ -13,8 +13,8 @@ pub enum ViewError {
     },
     /// This program does not include the page that plays the environments.
     #[error(
-        "this program was built without the page that plays the environments: run `cargo xtask web`, then build with --release; \
-         or play in the terminal with `--terminal`, or write the page of your own crate with `endless page --out FOLDER`"
+        "this program was built without the page that plays the environments: play in the terminal with `--terminal`; for the page, run \
+         `cargo xtask play` in a clone, or write the page of your own crate with `endless page --out FOLDER`"
     )]
     PageNotBuilt,
     /// The page of this program does not have the environment.
