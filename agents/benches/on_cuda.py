@@ -31,10 +31,9 @@ from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.ppo import minibatch_loss
 from endless_gym_agents.rollout import Segment
-from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
+from endless_gym_agents.settings import AGENTS, PPO, PRESETS, Model, Recurrence, Settings, Transformer
 from endless_gym_agents.train import choose_device, train
 
-AGENTS = ("none", "stack", "position", "gru", "lstm", "trxl", "gtrxl")
 TOLERANCE = 1e-3
 ENV = "Endless-MortarMayhem-v0"
 #: Environments, steps and `--compile` of the training measurements; the first are the paper's.

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from endless_gym_agents.settings import AGENTS
+
 PROGRAM = Path(__file__).parents[1] / "benches" / "on_cuda.py"
 
 
@@ -22,7 +24,7 @@ def test_parts_that_need_no_gpu_run_on_the_cpu(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "cuda.json").read_text())
     # On the CPU both sides are the same.
-    assert [row["agent"] for row in report["equality"]] == ["none", "stack", "position", "gru", "lstm", "trxl", "gtrxl"]
+    assert [row["agent"] for row in report["equality"]] == list(AGENTS)
     assert all(row["largest_difference"] == 0.0 for row in report["equality"])
     assert [(row["agent"], row["num_envs"], row["steps"]) for row in report["training"]] == [
         ("gru", 4, 16),
