@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use endless_gym_core::batch::{Batch, BatchBuffer};
+use endless_gym_core::batch::{Batch, BatchBuffer, BatchSection, Section};
 use endless_gym_core::envs::{EnvSpec, ObservationSpace};
 use endless_gym_core::pool::{Autoreset, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_service::{BatchLease, Trainer};
@@ -89,11 +89,15 @@ impl Environments {
     /// [`Error::Settings`] if it serves others.
     pub fn served(registry: &Registry, settings: &Settings, trainer: Trainer) -> Result<Self, Error> {
         let (served, config) = (trainer.specification(), pool_config(registry, settings)?);
-        let expected = (&*config.id, config.num_envs, settings.environment.groups, config.autoreset);
-        let given = (&*served.id, served.num_envs, served.groups, served.autoreset);
+        let features = registry.spec(&settings.env)?.features.len();
+        let expected = (&*config.id, config.num_envs, settings.environment.groups, config.autoreset, features);
+        let features = served.batch.section(BatchSection::Features).map_or(0, Section::width);
+        let given = (&*served.id, served.num_envs, served.groups, served.autoreset, features);
         if given != expected {
-            let text = |(id, num_envs, groups, autoreset): (&str, usize, usize, Autoreset)| {
-                format!("{groups} groups of {num_envs} environments {id} with autoreset {autoreset}")
+            let text = |(id, num_envs, groups, autoreset, features): (&str, usize, usize, Autoreset, usize)| {
+                format!(
+                    "{groups} groups of {num_envs} environments {id} with autoreset {autoreset} and {features} features"
+                )
             };
             return Err(Error::Settings(format!("the engine must serve {}, got {}", text(expected), text(given))));
         }

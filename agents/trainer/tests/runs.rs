@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::{Args, Command, FromArgMatches};
+use endless_gym_core::pool::PoolConfig;
 use endless_gym_core::random::Generator;
 use endless_gym_kernels::sequences::Sequences;
 use endless_gym_memory_gym::memory_gym;
@@ -124,11 +125,20 @@ fn a_run_with_an_engine_is_the_same_as_in_process() {
     let settings = settings(&arguments);
     let pool = pool_config(memory_gym(), &settings).unwrap();
     let config = EngineConfig { groups: 2, namespace: namespace.clone(), ..EngineConfig::new("learn", pool, 1) };
-    let mut engine = Engine::new(memory_gym(), &config).unwrap();
+    let wrong = EngineConfig {
+        service: "wrong".to_owned(),
+        pool: PoolConfig { features: false, ..config.pool.clone() },
+        ..config.clone()
+    };
+    let (mut engine, _wrong) =
+        (Engine::new(memory_gym(), &config).unwrap(), Engine::new(memory_gym(), &wrong).unwrap());
     let stop = AtomicBool::new(false);
     let run = std::thread::scope(|scope| {
         let running = scope.spawn(|| engine.run(&stop));
         let connect = ConnectConfig { namespace, timeout: Duration::from_secs(10), ..ConnectConfig::new("learn") };
+        let other = Trainer::connect(&ConnectConfig { service: "wrong".to_owned(), ..connect.clone() }).unwrap();
+        let error = Environments::served(memory_gym(), &settings, other).err().unwrap().to_string();
+        assert!(error.contains("same_step and 0 features"), "{error}");
         let connected = Trainer::connect(&connect);
         let run = connected.map_err(Error::from).and_then(|trainer| {
             let environments = |settings: &Settings| Environments::served(memory_gym(), settings, trainer);
