@@ -39,7 +39,7 @@ fn invalid_arguments_are_reported_before_the_page_is_served() {
         // POPGym is not on the page.
         (
             &["play", "popgym-RepeatFirstEasy-v0"],
-            "terminal with `--terminal`, or write the page of your own crate with `endless page --out",
+            "or write the page of your own crate with `endless page --out FOLDER`",
         ),
     ] {
         let output = place.run(arguments);
