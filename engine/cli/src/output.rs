@@ -25,6 +25,27 @@ pub fn table<const N: usize>(headings: [&str; N]) -> Table {
     table
 }
 
+/// The table's text. If it is wider than standard output, a block of lines for each row instead, so that no word or number breaks.
+pub fn fit(table: Table) -> String {
+    fit_into(table, usize::from(width()))
+}
+
+fn fit_into(mut table: Table, width: usize) -> String {
+    table.set_content_arrangement(ContentArrangement::Disabled);
+    let text = table.to_string();
+    if text.lines().all(|line| line.trim_end().chars().count() <= width) {
+        return text;
+    }
+    let headings: Vec<String> =
+        table.header().into_iter().flat_map(|row| row.cell_iter()).map(comfy_table::Cell::content).collect();
+    let longest = headings.iter().map(|heading| heading.chars().count()).max().unwrap_or(0);
+    let block = |row: &comfy_table::Row| {
+        let cells = headings.iter().zip(row.cell_iter());
+        cells.map(|(heading, cell)| format!("{heading:longest$}  {}", cell.content())).collect::<Vec<_>>().join("\n")
+    };
+    table.row_iter().map(block).collect::<Vec<_>>().join("\n\n")
+}
+
 /// Width of standard output in characters.
 pub fn width() -> u16 {
     terminal_size_of(io::stdout()).map_or(PIPE_WIDTH, |(Width(columns), _)| columns)
@@ -102,6 +123,20 @@ pub fn progress(length: u64, template: &str) -> ProgressBar {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_wide_table_becomes_lines_without_breaks() {
+        let made = || {
+            let mut table = table(["engine", "environment", "steps"]);
+            table.add_row(["a", "Endless-SearingSpotlights-v0", "123,456,789"]);
+            table.add_row(["b", "MysteryPath-v0", "7"]);
+            table
+        };
+        assert_eq!(fit_into(made(), 80).lines().count(), 4);
+        let lines = "engine       a\nenvironment  Endless-SearingSpotlights-v0\nsteps        123,456,789\n\n\
+                     engine       b\nenvironment  MysteryPath-v0\nsteps        7";
+        assert_eq!(fit_into(made(), 45), lines);
+    }
 
     #[test]
     fn thousands_are_separated_by_commas() {

@@ -9,7 +9,7 @@ use serde_json::{Value as Json, json};
 
 use super::failure::Failure;
 use super::options::seconds;
-use super::output::{clear, grouped, print, print_json, table};
+use super::output::{clear, fit, grouped, print, print_json, table};
 use super::stop;
 
 /// Time between the two readings from which steps per second are computed, unless `--watch` sets it.
@@ -161,7 +161,7 @@ fn engines(readings: &[Reading]) -> String {
             duration(status.groups.iter().filter_map(|group| group.busy).max()),
         ]);
     }
-    format!("{work}\n\n{users}")
+    format!("{}\n\n{}", fit(work), fit(users))
 }
 
 fn list(processes: &BTreeSet<u32>) -> String {
@@ -202,7 +202,7 @@ fn groups(status: &EngineStatus) -> String {
         Some(_) => format!(", {} checkpoints, the last {} ago", status.checkpoints, duration(status.last_checkpoint)),
         None => String::new(),
     };
-    format!("{rows}\n\nincarnation {incarnation:016x}{saved}")
+    format!("{}\n\nincarnation {incarnation:016x}{saved}", fit(rows))
 }
 
 /// A duration for people: `0.3s`, `12s`, `5m 3s`, `2h 5m`, `3d 2h`.
