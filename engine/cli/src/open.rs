@@ -30,9 +30,9 @@ impl PrivatePage {
         let page = PrivatePage(folder.join(format!("endless-{:016x}.html", RandomState::new().hash_one(url))));
         let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&page.0)?;
         let url = url.replace('&', "&amp;");
-        write!(
+        writeln!(
             file,
-            "<!doctype html><meta http-equiv=\"refresh\" content=\"0;url={url}\"><a href=\"{url}\">The page</a>\n"
+            "<!doctype html><meta http-equiv=\"refresh\" content=\"0;url={url}\"><a href=\"{url}\">The page</a>"
         )?;
         in_browser(&format!("file://{}", page.0.display()));
         Ok(page)
