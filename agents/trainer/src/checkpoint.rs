@@ -1,7 +1,7 @@
 //! Checkpoints: the state from which a run resumes exactly, in the format safetensors.
 //!
 //! The weights have their names and shapes in PyTorch's `state_dict`, so that any reader of the format finds them. The other tensors
-//! begin with `state/`, and the rest is JSON text in the entry [`METADATA`] of the metadata. The random numbers need no state: each update
+//! begin with `state/`, and the rest is JSON text in the entry `endless` of the metadata. The random numbers need no state: each update
 //! has a generator of its own.
 
 use std::fs::{self, File};
