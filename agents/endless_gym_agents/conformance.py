@@ -166,9 +166,9 @@ def check(
     """
     on = choose_device(device)
     memory = make_memory(agent, options, steps, on)
-    x, resets = drawn(memory, steps, on)
     if not state_bytes(memory.initial_state(1)):
         raise ValueError(f"agent `{agent}` has no memory to check")
+    x, resets = drawn(memory, steps, on)
     with torch.no_grad():
         played = play(memory, x, resets)
         yield at_most("agreement", float((learn(memory, x, played) - played.outputs).abs().max()), 1e-5)

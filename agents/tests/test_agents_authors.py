@@ -80,7 +80,8 @@ def test_recurrent_layers_equal_those_of_the_authors(name: str) -> None:
     hidden = hidden.transpose(1, 2)  # (parts, layers, sequences, hidden size)
     sequences, width = hidden.shape[2:]
     length = len(x) // sequences
-    given = Recurrence(width, recorded["layers"], recorded["residual"], sequence_length=length)
+    layers, residual = recorded["layers"], recorded["residual"]
+    given = Recurrence(hidden_size=width, layers=layers, residual=residual, sequence_length=length)
     memory = RecurrentMemory("lstm" if name == "lstm" else "gru", x.shape[1], given, CPU)
     transplanted(memory, recorded)
     with torch.no_grad():

@@ -58,6 +58,7 @@ def test_preset_paper_equals_the_table_of_the_paper() -> None:
     assert ppo.decay_updates * 16_384 == 163_840_000
     assert asdict(recurrence) == {
         "hidden_size": 512,
+        "match_gru": False,
         "layers": 1,
         "residual": False,
         "embedding": True,
