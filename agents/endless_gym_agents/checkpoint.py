@@ -21,9 +21,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
+from safetensors import SafetensorError, safe_open
 
 from endless_gym.specs import spec
-from endless_gym_agents import ranges, weights
+from endless_gym_agents import ranges
 from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.settings import Settings, Transformer, from_dict
 
@@ -31,10 +32,11 @@ from endless_gym_agents.settings import Settings, Transformer, from_dict
 CHECKPOINT_VERSION = 1
 
 #: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it. Checkpoints of
-#: `endless learn`, the trainer in Rust, end with `weights.SUFFIX` instead.
+#: `endless learn`, the trainer in Rust, end with `RUST_SUFFIX` instead.
 SETTINGS = "settings.json"
 FOLDER = "checkpoints"
 LAST = "last.pt"
+RUST_SUFFIX = ".safetensors"
 
 
 @dataclass
@@ -127,7 +129,7 @@ def files(run: str | Path) -> list[Path]:
 def last(run: str | Path) -> Path:
     """The last checkpoint of a run, which may not exist."""
     file = Path(run) / FOLDER / LAST
-    of_rust = file.with_suffix(weights.SUFFIX)
+    of_rust = file.with_suffix(RUST_SUFFIX)
     return of_rust if of_rust.exists() and not file.exists() else file
 
 
@@ -150,7 +152,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         raise FileNotFoundError(
             f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
         )
-    if file.suffix == weights.SUFFIX:
+    if file.suffix == RUST_SUFFIX:
         state = _read_of_rust(file)
     else:
         with file.open("rb") as content:
@@ -204,11 +206,15 @@ def _read(content: BinaryIO, file: Path) -> dict[str, Any]:
 
 def _read_of_rust(file: Path) -> dict[str, Any]:
     """As `_read`, of a checkpoint of `endless learn`, without what only that program needs to resume."""
-    tensors, metadata = weights.read(file)
+    try:
+        with safe_open(file, "pt") as content:
+            metadata = content.metadata() or {}
+            model = {name: content.get_tensor(name) for name in content.keys() if not name.startswith("state/")}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{file} is not a file of safetensors, or is truncated: {error}") from error
     if "endless" not in metadata:
         raise ValueError(f"{file} is not a checkpoint of `endless learn`: it has weights only")
     header = json.loads(metadata["endless"])
-    model = {name: tensor for name, tensor in tensors.items() if not name.startswith("state/")}
     return {**{name: header.get(name) for name in ("version", "settings", "update", "steps")}, "model": model}
 
 

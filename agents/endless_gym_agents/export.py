@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from safetensors.torch import save_file
 
 from endless_gym.create import make_vec
 from endless_gym.specs import spec
@@ -42,7 +43,6 @@ from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.metrics import TASK_PROGRESS
 from endless_gym_agents.ranges import Positive
 from endless_gym_agents.settings import Settings, from_dict, to_dict
-from endless_gym_agents.weights import write
 
 #: The first bytes of a file.
 MAGIC = b"ENDLAGNT"
@@ -239,7 +239,9 @@ def execute(arguments: ExportArguments) -> None:
         checkpoint = load(arguments.source)
         agent = checkpoint.agent
         if arguments.weights is not None:
-            write(arguments.weights, agent.state_dict())
+            save_file(
+                {name: part.float().cpu().contiguous() for name, part in agent.state_dict().items()}, arguments.weights
+            )
         if arguments.out is not None:
             content = export(checkpoint)
             arguments.out.write_bytes(content)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
 from endless_gym_agents import checkpoint, export, plot, ppo, protocol
@@ -23,7 +24,6 @@ from endless_gym_agents.logs import read_progress
 from endless_gym_agents.rollout import RolloutCollector
 from endless_gym_agents.run_folder import RunInUse, locked
 from endless_gym_agents.train import parse, train
-from endless_gym_agents.weights import read
 
 FLAGS = "--environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 16 --recurrence.sequence-length 6 "
 FLAGS += "--recurrence.hidden-size 16 --model.head-width 8 --ppo.minibatches 1 --no-stop-when-learnt --keep-checkpoints"
@@ -115,7 +115,7 @@ def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monk
     started = numbered(new_run(tmp_path / "next", f"--init-from {file} --ppo.updates 1"), 0).agent.state_dict()
     trained = checkpoint.load(ours).agent.state_dict()
     assert all(torch.equal(weights, started[name]) for name, weights in trained.items())
-    assert set(read(file)[0]) == set(trained)
+    assert set(load_file(file)) == set(trained)
 
 
 @contextmanager
