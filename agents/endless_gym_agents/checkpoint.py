@@ -165,6 +165,10 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     if missing := [name for name in ("settings", "update", "steps", "model") if name not in state]:
         raise ValueError(f"checkpoint {file} is incomplete: it has no {', '.join(missing)}")
     try:
+        # A small file may have tensors of any size, whose strides repeat a few numbers.
+        claimed, size = sum(weights.nbytes for weights in state["model"].values()), file.stat().st_size
+        if claimed > size:
+            raise ValueError(f"its weights claim {claimed} bytes, and the file has {size}")
         agent, settings = _agent(state, device)
     except Exception as error:  # of settings of any content, `load_state_dict`, and modules of the user's own
         reason = str(error).replace("\n\t", " ")
@@ -214,8 +218,12 @@ def _read_of_rust(file: Path) -> dict[str, Any]:
         raise ValueError(f"{file} is not a file of safetensors, or is truncated: {error}") from error
     if "endless" not in metadata:
         raise ValueError(f"{file} is not a checkpoint of `endless learn`: it has weights only")
-    header = json.loads(metadata["endless"])
-    return {**{name: header.get(name) for name in ("version", "settings", "update", "steps")}, "model": model}
+    try:
+        header = json.loads(metadata["endless"])
+        state = {name: header[name] for name in ("version", "settings", "update", "steps")}
+    except (KeyError, RecursionError, TypeError, ValueError) as error:
+        raise ValueError(f"checkpoint {file} is damaged: {error}") from error
+    return state | {"model": model}
 
 
 def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Settings]:
@@ -230,7 +238,9 @@ def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Se
         with torch.device("meta"):
             expected = make_agent(settings, spec(settings.env), "meta").state_dict()
         for name, tensor in expected.items():
-            if name in model and model[name].shape != tensor.shape:
+            if name not in model:
+                raise ValueError(f"there are no weights {name}")
+            if model[name].shape != tensor.shape:
                 given, wanted = tuple(model[name].shape), tuple(tensor.shape)
                 raise ValueError(f"{name} must have shape {wanted} according to the settings, got {given}")
     agent = make_agent(settings, spec(settings.env), device)

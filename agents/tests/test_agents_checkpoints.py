@@ -21,7 +21,9 @@ import pytest
 import torch
 from agents_helpers import saved, settings
 
+from endless_gym.specs import spec
 from endless_gym_agents import checkpoint, train
+from endless_gym_agents.agent import make_agent
 from endless_gym_agents.settings import to_dict
 
 
@@ -84,7 +86,7 @@ def test_the_message_names_what_is_wrong(file: Path, tmp_path: Path) -> None:
         ({"model": None}, "is incomplete: it has no model"),
         ({"settings": None, "steps": None}, "is incomplete: it has no settings, steps"),
         ({"model": weights | {name: torch.full_like(weights[name], torch.nan)}}, f"not finite, in {name}"),
-        ({"model": {key: part for key, part in weights.items() if key != name}}, f'Missing key.*"{name}"'),
+        ({"model": {key: part for key, part in weights.items() if key != name}}, f"there are no weights {name}"),
         ({"settings": to_dict(other)}, r"must have shape \(.*17.*\) according to the settings, got"),
         ({"settings": to_dict(dataclasses.replace(other, env="Other-v0"))}, "id must be one of"),
         ({"settings": 3}, "settings or weights are invalid"),
@@ -117,6 +119,27 @@ def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_built
     with pytest.raises(ValueError, match=r"settings or weights are invalid"):
         checkpoint.load(forged)
     assert time.process_time() - start < 2
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 200_000  # kilobytes
+
+
+@pytest.mark.parametrize("repeats", [True, False])
+def test_weights_that_repeat_few_numbers_or_are_missing_take_no_memory(
+    repeats: bool, file: Path, tmp_path: Path
+) -> None:
+    """The settings claim 3 GB in a file of a few kilobytes."""
+    claimed = settings("gru", model={"head_width": 20_000, "body_width": 20_000})
+    with torch.device("meta"):
+        shapes = {
+            name: part.shape for name, part in make_agent(claimed, spec(claimed.env), "meta").state_dict().items()
+        }
+    weights = {name: torch.zeros(()).expand(shape) for name, shape in shapes.items()} if repeats else {}
+    forged = changed(
+        file, tmp_path / "forged.pt", settings=to_dict(claimed), model=weights, optimizer=None, player=None
+    )
+    assert forged.stat().st_size < 100_000
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=r"claim 3|there are no weights"):
+        checkpoint.load(forged)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 200_000  # kilobytes
 
 

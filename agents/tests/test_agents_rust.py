@@ -1,6 +1,8 @@
 """Runs of `endless learn`, the trainer in Rust: the same numbers as those of the Python agents, which read them."""
 
+import json
 import signal
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from endless_gym_agents import checkpoint, export, plot, ppo, protocol
@@ -116,6 +118,30 @@ def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monk
     trained = checkpoint.load(ours).agent.state_dict()
     assert all(torch.equal(weights, started[name]) for name, weights in trained.items())
     assert set(load_file(file)) == set(trained)
+
+
+def test_a_damaged_or_forged_checkpoint_is_refused(tmp_path: Path) -> None:
+    run = new_run(tmp_path / "run", "--ppo.updates 1")
+    file = run / "checkpoints" / "last.safetensors"
+    content = np.fromfile(file, np.uint8)
+    for length in (*range(0, len(content), 997), len(content) - 1):
+        content[:length].tofile(file)
+        with pytest.raises(ValueError, match="safetensors"):
+            checkpoint.load(file)
+    content.tofile(file)
+    weights, whole = load_file(file), checkpoint.load(file).state
+    header = {name: whole[name] for name in ("version", "settings", "update", "steps")}
+    for text in ("[" * 100_000, '{"a":' * 100_000, "[]", "3", "{}", json.dumps(header | {"settings": 3})):
+        save_file(weights, file, {"endless": text})
+        with pytest.raises(ValueError, match=r"is damaged|are invalid"):
+            checkpoint.load(file)
+    # A header of the format that claims more than the file has.
+    for entry in ({"shape": [10**9], "data_offsets": [0, 4 * 10**9]}, {"shape": [10**10] * 3, "data_offsets": [0, 4]}):
+        head = json.dumps({"a": {"dtype": "F32", **entry}}).encode()
+        for length in (len(head), 10**9, 2**63):
+            file.write_bytes(struct.pack("<Q", length) + head + bytes(4))
+            with pytest.raises(ValueError, match="is not a file of safetensors"):
+                checkpoint.load(file)
 
 
 @contextmanager
