@@ -125,12 +125,46 @@ fn a_running_engine_is_shown_lost_and_found() {
     engine.kill();
     browser.wait("document.getElementById('state').dataset.state === 'lost'");
     assert_eq!(browser.value("document.getElementById('state').textContent"), "lost: waiting for the engine");
+    // The times since its start and since its last request go on.
+    let times = "[...document.querySelectorAll('#numbers dd')].slice(-2).map((time) => time.textContent)";
+    browser.value(&format!("globalThis.times = {times}; 0"));
+    browser.wait(&format!("{times}.every((time, place) => time.endsWith(' s ago') && time !== times[place])"));
     let _engine = serve(&place);
-    browser.wait("document.getElementById('state').dataset.state === 'live'");
+    browser.wait("document.getElementById('state').textContent === 'no trainer'");
     let training = Training::start(&place);
     browser.value("globalThis.shown = endless.frames; 0");
     browser.wait("endless.frames > shown + 3");
     training.end();
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs Chromium"]
+fn an_empty_list_a_missing_engine_and_a_missing_trainer_are_named() {
+    let place = Place::new();
+    let (list, server) = (Server::start(place.endless(&["view"])), Server::start(place.endless(&["view", "endless"])));
+    let mut browser = start("missing");
+    let shown =
+        |browser: &mut Chromium, text: &str| browser.wait(&format!("document.body.innerText.includes('{text}')"));
+    browser.load(&list.url);
+    shown(&mut browser, &format!("No engine is running in {}.", place.namespace().root().display()));
+    assert_eq!(browser.value("document.querySelector('table').checkVisibility()"), false);
+    browser.load(&server.url);
+    shown(&mut browser, "The engine endless does not run.");
+    let _engine = serve(&place);
+    shown(&mut browser, "No trainer is connected to this engine.");
+    assert_eq!(browser.value("document.getElementById('state').textContent"), "no trainer");
+    let mut trainer = place.trainer("endless").unwrap();
+    trainer.reset(0, ResetRequest::Seed(1)).unwrap();
+    trainer.receive(0, Duration::from_secs(60)).unwrap();
+    browser.wait(SHOWN);
+    assert_eq!(browser.value("document.getElementById('nothing').checkVisibility()"), false);
+    // The trainer pauses, and another page opens.
+    browser.load("about:blank");
+    browser.load(&server.url);
+    browser.wait("document.getElementById('state')?.textContent === 'live'");
+    browser.load(&list.url);
+    browser.wait("document.querySelectorAll('#engines tr').length === 1");
     assert_eq!(browser.complaints, Vec::<String>::new());
 }
 
@@ -181,7 +215,7 @@ fn other_sites_and_addresses_without_the_token_are_refused() {
          socket.onopen = () => done('open'); socket.onerror = () => done('refused') }})"
     );
     browser.load(&server.url);
-    browser.wait("document.getElementById('state')?.dataset.state === 'live'");
+    browser.wait("document.getElementById('state')?.dataset.state === 'idle'");
     assert_eq!(browser.value(&open), "open", "the page's own");
     // DNS rebinding: another site's name resolves to this machine, and its page knows the token.
     browser.load(&format!("http://{REBOUND}:{port}/?token={token}"));

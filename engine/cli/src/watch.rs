@@ -74,8 +74,13 @@ impl Statistics {
         self.episodes.add(&observed.lease.batch());
     }
 
+    /// Environment steps so far.
+    pub fn steps(&self) -> u64 {
+        self.batches * self.num_envs
+    }
+
     /// Environment steps per second since the last call.
-    pub fn rate(&mut self) -> f64 {
+    fn rate(&mut self) -> f64 {
         let (moment, before) = std::mem::replace(&mut self.since, (Instant::now(), self.batches));
         ((self.batches - before) * self.num_envs) as f64 / moment.elapsed().as_secs_f64().max(1e-3)
     }

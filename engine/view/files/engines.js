@@ -9,23 +9,30 @@ export async function engines() {
   return answer.json();
 }
 
-/** The table of engines, with steps per second since the previous call of `show`. */
+/** Milliseconds over which steps per second are averaged, as in the curves. */
+const WINDOW = 10_000;
+
+/** The table of engines. */
 export class Table {
   constructor(body, choose) {
     this.body = body;
     this.choose = choose;
-    this.before = new Map();
+    // By run, the counts of the window and the last one before it.
+    this.counts = new Map();
   }
 
   show(list) {
     const now = performance.now();
-    this.body.replaceChildren(...list.map((engine) => this.#row(engine, now)));
-    this.before = new Map(list.map((engine) => [engine.incarnation, { steps: engine.env_steps, now }]));
+    this.counts = new Map(list.map(({ incarnation, env_steps: steps }) => {
+      const counts = [...(this.counts.get(incarnation) ?? []), { steps, now }];
+      return [incarnation, counts.slice(Math.max(0, counts.findLastIndex((count) => now - count.now >= WINDOW)))];
+    }));
+    this.body.replaceChildren(...list.map((engine) => this.#row(engine)));
   }
 
-  #row(engine, now) {
-    const before = this.before.get(engine.incarnation);
-    const rate = before ? ((engine.env_steps - before.steps) / (now - before.now)) * 1000 : null;
+  #row(engine) {
+    const [first, last] = [0, -1].map((place) => this.counts.get(engine.incarnation).at(place));
+    const rate = first === last ? null : ((last.steps - first.steps) / (last.now - first.now)) * 1000;
     const row = document.createElement("tr");
     const button = document.createElement("button");
     button.type = "button";

@@ -8,6 +8,9 @@ import { duration, grouped, megabytes, processes, short } from "./numbers.js";
 const $ = (id) => document.getElementById(id);
 const RETRY = 1000;
 
+/** Seconds after a request for which an engine counts as used, although its list of trainers may be older than the trainer. */
+const USED = 6;
+
 /** Maximum number of environments for which the grid has captions. */
 const CAPTIONS = 36;
 
@@ -17,6 +20,7 @@ class View {
     this.socket = null;
     this.frames = 0;
     this.about = null;
+    this.status = {};
     this.newest = null;
     this.group = 0;
     this.first = 0;
@@ -32,6 +36,8 @@ class View {
     if (service) this.show(service);
     // Listing costs more than reading one engine's status, so refresh only while the list is visible.
     setInterval(() => this.service === "" && !document.hidden && this.#list().catch(() => {}), 2000);
+    // The times of a lost engine go on.
+    setInterval(() => this.service && this.#numbers(), 1000);
   }
 
   /** Shows an engine, or the list for an empty name. */
@@ -41,7 +47,7 @@ class View {
     $("large").hidden = true;
     this.socket?.close();
     this.curves.clear();
-    this.#numbers({});
+    this.#read({});
     $("live").hidden = service === "";
     $("list").hidden = service !== "";
     $("grid").replaceChildren();
@@ -65,6 +71,8 @@ class View {
     $("engine").value = this.service ?? "";
     this.table.show(answer.engines);
     $("none").hidden = answer.engines.length > 0;
+    $("table").hidden = answer.engines.length === 0;
+    $("root").textContent = answer.root;
     if (this.service === null && !answer.service) this.show("");
     return answer;
   }
@@ -96,13 +104,22 @@ class View {
   }
 
   #received({ about, pixels }) {
-    const words = { live: "live", lost: "lost: waiting for the engine", waiting: "waiting for the engine", refused: about.reason };
-    this.#state(about.state, words[about.state]);
-    if (about.state !== "live") return;
+    const words = { lost: "lost: waiting for the engine", waiting: "waiting for the engine", refused: about.reason };
+    if (about.state !== "live") {
+      $("nothing").textContent = `The engine ${this.service} does not run. This page shows it when it starts.`;
+      this.#state(about.state, words[about.state]);
+      return;
+    }
+    const { trainers, seconds_since_request: since } = about.status ?? {};
+    const isUsed = trainers?.length > 0 || (since ?? Infinity) < USED;
+    this.#state(isUsed ? "live" : "idle", isUsed ? "live" : "no trainer");
+    $("nothing").textContent = isUsed
+      ? "The trainer has not stepped this engine since this page was opened. Its next step appears here."
+      : "No trainer is connected to this engine. The environments appear with its first step.";
     const before = this.about;
     this.about = about;
     if (before?.num_envs !== about.num_envs || before?.groups !== about.groups) this.#layout(about);
-    if (about.status) this.#numbers(about.status);
+    if (about.status && about.status.uptime_seconds !== this.status.uptime_seconds) this.#read(about.status);
     if (!about.batch || about.batch.group !== this.group || about.batch.envs.length === 0) return;
     this.frames += 1;
     const { frame, envs } = about.batch;
@@ -120,7 +137,15 @@ class View {
     $("live").classList.toggle("lost", state === "lost");
   }
 
-  #numbers(status) {
+  /** Keeps the engine's status and the time of its reading. */
+  #read(status) {
+    [this.status, this.readAt] = [status, performance.now()];
+    this.#numbers();
+  }
+
+  #numbers() {
+    const { status } = this;
+    const ago = (seconds) => `${duration(seconds + (performance.now() - this.readAt) / 1000)} ago`;
     const values = [
       ["Environment", status.id ?? "–"],
       ["Environments", status.groups === undefined ? "–" : `${status.groups} × ${status.num_envs}`],
@@ -128,8 +153,8 @@ class View {
       ["Shared memory", megabytes(status.shared_memory_bytes)],
       ["Held batches", `${grouped(status.held)} + ${grouped(status.held_by_observers)} observed`],
       ["Trainer", processes(status.trainers)],
-      ["Last request", (status.seconds_since_request ?? null) === null ? "none" : `${duration(status.seconds_since_request)} ago`],
-      ["Up", duration(status.uptime_seconds)],
+      ["Last request", (status.seconds_since_request ?? null) === null ? "none" : ago(status.seconds_since_request)],
+      ["Started", status.uptime_seconds === undefined ? "–" : ago(status.uptime_seconds)],
     ];
     const rows = values.map(([term, value]) => {
       const row = document.createElement("div");

@@ -22,5 +22,5 @@ mod watcher;
 pub use error::ViewError;
 pub use metrics::MetricsServer;
 pub use play::PlayServer;
-pub use statistics::RecentEpisodes;
+pub use statistics::{RecentEpisodes, RecentRate};
 pub use view::ViewServer;

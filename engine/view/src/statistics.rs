@@ -1,7 +1,7 @@
 //! Episodes and speed of an engine over time.
 
 use std::collections::VecDeque;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::Batch;
 use endless_gym_service::EngineStatus;
@@ -13,12 +13,15 @@ const WINDOW: usize = 1000;
 /// Maximum number of points kept, one per second.
 const MAX_POINTS: usize = 3600;
 
+/// Time over which steps per second are averaged, so that a trainer's pauses for learning do not appear as drops to 0.
+const RATE_WINDOW: Duration = Duration::from_secs(10);
+
 /// The statistics of an engine at one time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(crate) struct Point {
     /// Seconds since the engine started.
     pub seconds: f64,
-    /// Environment steps per second since the previous point.
+    /// Environment steps per second over the last 10 seconds, or since the observation began.
     pub steps_per_second: f64,
     /// Episodes that have ended since the engine started.
     pub episodes: u64,
@@ -57,6 +60,25 @@ impl RecentEpisodes {
     }
 }
 
+/// Counts per second over the last 10 seconds.
+#[derive(Debug, Default)]
+pub struct RecentRate {
+    /// Counts in the window, and the last one before it.
+    counts: VecDeque<(Instant, u64)>,
+}
+
+impl RecentRate {
+    /// Adds the count at a time, and returns the rate since the beginning of the window or the first count; `None` for the first.
+    pub fn add(&mut self, now: Instant, count: u64) -> Option<f64> {
+        self.counts.push_back((now, count));
+        while self.counts.get(1).is_some_and(|(time, _)| now - *time >= RATE_WINDOW) {
+            self.counts.pop_front();
+        }
+        let (begin, before) = *self.counts.front().filter(|_| self.counts.len() > 1)?;
+        Some(count.saturating_sub(before) as f64 / (now - begin).as_secs_f64().max(1e-3))
+    }
+}
+
 /// The points of one run of an engine.
 #[derive(Debug, Default)]
 pub(crate) struct History {
@@ -65,8 +87,7 @@ pub(crate) struct History {
     /// Points that were dropped from the front.
     dropped: u64,
     points: VecDeque<Point>,
-    /// When steps were last counted, and how many there were.
-    counted: Option<(Instant, u64)>,
+    rate: RecentRate,
     pub recent: RecentEpisodes,
 }
 
@@ -77,17 +98,17 @@ impl History {
             *self = History { incarnation, ..History::default() };
         }
         // Rates must not include the time without observation.
-        self.counted = None;
+        self.rate = RecentRate::default();
     }
 
     /// Adds a point. The first status gives none, since a rate needs two.
     pub fn point(&mut self, status: &EngineStatus) {
-        let (now, steps) = (Instant::now(), status.total(|group| group.env_steps));
-        let Some((moment, before)) = self.counted.replace((now, steps)) else { return };
+        let steps = status.total(|group| group.env_steps);
+        let Some(steps_per_second) = self.rate.add(Instant::now(), steps) else { return };
         let means = self.recent.means();
         let point = Point {
             seconds: status.uptime.as_secs_f64(),
-            steps_per_second: steps.saturating_sub(before) as f64 / (now - moment).as_secs_f64().max(1e-3),
+            steps_per_second,
             episodes: status.total(|group| group.episodes),
             mean_return: means.map(|means| means.0),
             mean_length: means.map(|means| means.1),
@@ -103,5 +124,25 @@ impl History {
     pub fn since(&self, from: u64) -> (Vec<Point>, u64) {
         let skipped = usize::try_from(from.saturating_sub(self.dropped)).unwrap_or(usize::MAX);
         (self.points.iter().skip(skipped).copied().collect(), self.dropped + self.points.len() as u64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_are_averaged_over_phases_without_steps_and_fall_to_zero_after_the_last() {
+        let (start, mut rate) = (Instant::now(), RecentRate::default());
+        assert_eq!(rate.add(start, 0), None);
+        // 1,000 steps a second in phases of two seconds, with two seconds of learning between them.
+        let (mut steps, mut rates) = (0, Vec::new());
+        for second in 1..=40 {
+            steps += if second % 4 < 2 { 1000 } else { 0 };
+            rates.extend(rate.add(start + Duration::from_secs(second), steps));
+        }
+        assert!(rates[10..].iter().all(|rate| (400.0..=600.0).contains(rate)), "{rates:?}");
+        let last = (41..=60).filter_map(|second| rate.add(start + Duration::from_secs(second), steps)).last();
+        assert_eq!(last, Some(0.0));
     }
 }

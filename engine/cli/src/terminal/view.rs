@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use endless_gym_core::batch::Frames;
 use endless_gym_core::raster::FrameShape;
 use endless_gym_service::{Observed, ServiceError};
+use endless_gym_view::RecentRate;
 use ratatui::Frame;
 use ratatui::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers};
 use ratatui::layout::Rect;
@@ -24,7 +25,7 @@ use super::status;
 /// Time between two drawings of the screen.
 const INTERVAL: Duration = Duration::from_millis(100);
 
-/// Time over which steps per second are measured.
+/// Time between two computations of the steps per second.
 const RATE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Longest wait for a batch between checks of the keys.
@@ -140,6 +141,8 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     let title = format!("{service} {}", specification.id);
     let mut screen = Screen::enter()?;
     let (mut has_ended, mut drawn, mut rate, mut rated) = (false, None::<Instant>, 0.0, Instant::now());
+    let mut recent = RecentRate::default();
+    recent.add(rated, 0);
     while !stop.load(Ordering::Relaxed) && !is_quit(&screen, has_ended)? {
         if !has_ended {
             match observers.next(SLICE) {
@@ -153,7 +156,8 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
             }
         }
         if rated.elapsed() >= RATE_INTERVAL {
-            (rate, rated) = (statistics.rate(), Instant::now());
+            rated = Instant::now();
+            rate = recent.add(rated, statistics.steps()).unwrap_or(0.0);
         }
         if drawn.is_none_or(|time| time.elapsed() >= INTERVAL) {
             drawn = Some(Instant::now());
