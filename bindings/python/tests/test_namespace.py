@@ -1,0 +1,137 @@
+"""Who can use the files of engines, which directories and names are refused, and what a failing observer does to an engine."""
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from support import engine_of_program, segments
+
+import endless_gym
+
+ID = "MortarMayhem-Grid-v0"
+
+
+@pytest.fixture
+def parent(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder whose path is short enough for that of a root directory; `root` in it is the namespace."""
+    with TemporaryDirectory(prefix="eg-", dir="/tmp") as folder:
+        monkeypatch.setenv("ENDLESS_GYM_ROOT", f"{folder}/root")
+        yield Path(folder)
+
+
+@pytest.mark.parametrize("umask", [0, 0o077])
+def test_only_the_owner_can_use_the_files_whatever_the_umask(umask: int, parent: Path) -> None:
+    before = os.umask(umask)
+    try:
+        with endless_gym.serve(ID, 2) as envs, endless_gym.watch(envs._engine.service) as batches:
+            envs.reset()
+            next(batches)
+            root = parent / "root"
+            files = [root, *(Path("/dev/shm") / name for name in segments()), *root.glob("*")]
+            open_to_others = [str(file) for file in files if file.is_file() and file.stat().st_mode & 0o077]
+            assert len(files) > 5 and not open_to_others and not root.stat().st_mode & 0o077
+    finally:
+        os.umask(before)
+
+
+def refused(reason: str) -> None:
+    for call in (endless_gym.running_engines, lambda: endless_gym.serve(ID, 1), lambda: endless_gym.connect("gym")):
+        with pytest.raises((RuntimeError, OSError), match=reason):
+            call()
+
+
+def test_a_root_directory_that_others_made_or_can_write_to_is_refused(parent: Path) -> None:
+    root, other = parent / "root", parent / "other"
+    other.mkdir(mode=0o700)
+    root.symlink_to(other)
+    refused("it must be a directory")
+    assert not list(other.iterdir())
+    root.unlink()
+    root.write_text("")
+    refused(str(root))
+    root.unlink()
+    for mode, reason in ((0o777, "chmod go-w"), (0o720, "chmod go-w"), (0o1777, "shared with other users")):
+        root.mkdir()
+        root.chmod(mode)
+        refused(reason)
+        assert not list(root.iterdir())
+        root.rmdir()
+    if os.getuid() == 0:
+        root.mkdir(mode=0o700)
+        os.chown(root, 65534, 65534)
+        refused("belongs to user 65534")
+        assert not list(root.iterdir())
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a directory to another user")
+def test_a_root_directory_that_another_user_exchanged_is_not_followed(parent: Path) -> None:
+    """Who can write to the parent directory can rename the root and make another."""
+    parent.chmod(0o777)
+    root = parent / "root"
+    with endless_gym.serve(ID, 2) as envs:
+        envs.reset()
+        root.rename(parent / "taken")
+        root.mkdir(mode=0o700)
+        os.chown(root, 65534, 65534)
+        refused("belongs to user 65534")
+        assert not list(root.iterdir())
+        root.rmdir()
+        root.symlink_to(parent / "taken")
+        refused("it must be a directory")
+        root.unlink()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", "g\u0443m", "gym\u200b", "\uff47\uff59\uff4d", "gym\n", "gym\0", "../gym", "a/b", "a" * 65, "\u00e9" * 64],
+)
+def test_names_that_look_alike_or_are_paths_are_refused(name: str) -> None:
+    for call in (endless_gym.connect, endless_gym.watch):
+        with pytest.raises(ValueError, match=r"letters|characters"):
+            call(name, timeout=0)
+
+
+def test_engines_whose_names_begin_alike_are_told_apart(parent: Path) -> None:
+    names = ["gym", "gym1", "gym.1", "GYM", "g" * 64, "g" * 63]
+    with contextlib.ExitStack() as engines:
+        for number, name in enumerate(names):
+            engines.enter_context(engine_of_program(name, ID, f"--num-envs={number + 1}"))
+        with contextlib.ExitStack() as connected:
+            for number, name in enumerate(names):
+                envs = connected.enter_context(contextlib.closing(endless_gym.connect(name, timeout=30)))
+                assert envs.num_envs == number + 1
+        assert sorted(endless_gym.running_engines()) == sorted(names)
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "option"),
+    [("RLIMIT_NOFILE", 12, "ulimit -n"), ("RLIMIT_FSIZE", 0, "ulimit -f"), ("RLIMIT_AS", 0, "ulimit -v")],
+)
+def test_an_engine_survives_an_observer_that_cannot_attach(limit: str, value: int, option: str, parent: Path) -> None:
+    """The limit of the address space leaves the observer a megabyte."""
+    text = f"""
+import resource, sys, endless_gym
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+value = {value} or (used + 2**20 if {limit!r} == "RLIMIT_AS" else 0)
+resource.setrlimit(resource.{limit}, (value, value))
+with endless_gym.watch("gym", timeout=5) as batches:
+    next(batches)
+"""
+    actions = np.zeros(2, dtype=np.int64)
+    with (
+        engine_of_program("gym", ID, "--num-envs=2"),
+        contextlib.closing(endless_gym.connect("gym", timeout=30)) as envs,
+    ):
+        envs.reset(seed=1)
+        observer = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=60)
+        error = observer.stderr.strip().splitlines()
+        assert observer.returncode == 1 and option in error[-1], error
+        for _ in range(3):
+            envs.step(actions)
+    assert not segments()
