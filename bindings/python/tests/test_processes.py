@@ -4,6 +4,7 @@ import gc
 import logging
 import os
 import random
+import resource
 import shutil
 import signal
 import subprocess
@@ -350,6 +351,44 @@ def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
         endless_gym.serve(ID, resume=True)
     with endless_gym.serve(ID) as envs, pytest.raises(RuntimeError, match="no checkpoint file"):
         envs.checkpoint()
+
+
+def test_a_full_disk_leaves_the_former_checkpoint(tmp_path: Path) -> None:
+    file = tmp_path / "state"
+    with endless_gym.serve(ID, 4, checkpoint=file, checkpoint_every=3600.0) as envs:
+        envs.reset(seed=1)
+        envs.step(ACTIONS)
+        assert envs.checkpoint() == [2]
+        former = file.read_bytes()
+        for limit in (0, 1, len(former) // 2):
+            resource.prlimit(envs._engine.pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+            with pytest.raises(RuntimeError, match=r"state cannot be written.*File too large"):
+                envs.checkpoint()
+            assert file.read_bytes() == former
+            # The engine plays on.
+            envs.step(ACTIONS)
+        resource.prlimit(envs._engine.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        assert envs.checkpoint() == [5] and file.read_bytes() != former
+        os.kill(envs._engine.pid, signal.SIGKILL)
+    file.write_bytes(former)
+    with endless_gym.serve(ID, 4, checkpoint=file, resume=True) as envs:
+        assert [group.step for group in envs.reconnect().groups] == [2]
+
+
+def test_an_engine_killed_while_it_saves_leaves_a_whole_checkpoint(tmp_path: Path) -> None:
+    file, draws, last = tmp_path / "state", np.random.default_rng(3), 0
+    for _ in range(6):
+        with endless_gym.serve(ID, 4, checkpoint=file, checkpoint_every=0.001, resume=file.exists()) as envs:
+            step = envs.reconnect().groups[0].step
+            assert step >= last
+            envs.reset()
+            end = time.monotonic() + draws.uniform(0.05, 0.3)
+            while time.monotonic() < end:
+                envs.step(ACTIONS)
+            last = envs.checkpoint()[0]
+            envs.send(ACTIONS)
+            os.kill(envs._engine.pid, signal.SIGKILL)
+    assert {each.name for each in tmp_path.iterdir()} <= {"state", "state.new", "state.lock"}
 
 
 def test_events_are_logged_by_python(caplog: pytest.LogCaptureFixture) -> None:
