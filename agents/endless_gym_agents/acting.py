@@ -84,17 +84,18 @@ class ActingWeights:
 def acting_weights(
     version: int,
     dtype: torch.dtype,
+    after: torch.dtype,
     vector: nn.Sequential | None,
     embedding: nn.Sequential | None,
     body: nn.Sequential,
     policy: PolicyHead,
     value: ValueHead,
 ) -> ActingWeights:
-    """Make `ActingWeights` from the agent's layers; `dtype` is the type to compute in."""
+    """Make `ActingWeights` from the agent's layers, which compute in `dtype` up to the embedding, and in `after` beyond."""
     (policy_bias, policy_weight), (value_bias, value_weight) = (
-        transposed(layer, dtype) for layer in (policy.hidden[0], value.layers[0])
+        transposed(layer, after) for layer in (policy.hidden[0], value.layers[0])
     )
-    branches = [transposed(layer, dtype) for layer in policy.branches]
+    branches = [transposed(layer, after) for layer in policy.branches]
     choices, width = max(len(bias) for bias, _ in branches), policy_weight.shape[1]
     outputs = len(branches) * choices + 1
     bias = policy_bias.new_full((outputs,), NO_CHOICE)
@@ -103,14 +104,14 @@ def acting_weights(
         columns = slice(number * choices, number * choices + len(branch_bias))
         bias[columns] = branch_bias
         weight[:width, columns] = branch_weight
-    last_bias, last_weight = transposed(value.layers[2], dtype)
+    last_bias, last_weight = transposed(value.layers[2], after)
     bias[-1:] = last_bias
     weight[width:, -1:] = last_weight
     return ActingWeights(
         version=version,
         vector=None if vector is None else transposed(vector[0], dtype),
         embedding=None if embedding is None else transposed(embedding[0], dtype),
-        body=transposed(body[0], dtype),
+        body=transposed(body[0], after),
         hidden=(torch.cat([policy_bias, value_bias]), torch.cat([policy_weight, value_weight], dim=1)),
         output=(bias, weight),
         branches=len(branches),

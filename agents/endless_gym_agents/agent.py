@@ -306,8 +306,8 @@ class Agent(nn.Module):
         """
         weights = self.acting_weights()
         reset_mask = None if memory.reset_mask is memory.no_reset else memory.reset_mask
-        with self.autocast():
-            x = self._embed(observed, weights) if embedded is None else embedded
+        x = self._embed(observed, weights) if embedded is None else embedded
+        with self.autocast_after_embedding():
             hidden, memory_update = self.memory.step(x, memory.state, reset_mask)
             outputs = weights.heads(hidden)
         logits = weights.logits(outputs)
@@ -318,7 +318,7 @@ class Agent(nn.Module):
     @torch.no_grad()
     def remember(self, memory: AgentMemory, decision: Decision, transform_state: TransformState) -> None:
         """Update the memory after `decide`; the next observation continues the episodes until `AgentMemory.reset`."""
-        with self.autocast():
+        with self.autocast_after_embedding():
             self.memory.update_state(memory.state, decision.memory_update)
         memory.transform_state = transform_state
         memory.reset_mask = memory.no_reset
@@ -349,9 +349,10 @@ class Agent(nn.Module):
         version = weights_version(self._watched)
         if self._weights is None or self._weights.version != version:
             dtype = torch.bfloat16 if self.settings.bf16 else torch.float32
+            after = torch.float32 if self._is_float32_after_embedding else dtype
             with torch.no_grad():
                 layers = (self.encoder.vector, self.memory.embedding, self.body, self.policy, self.value)
-                self._weights = acting_weights(version, dtype, *layers)
+                self._weights = acting_weights(version, dtype, after, *layers)
                 self.memory.refresh(dtype)
         return self._weights
 
@@ -368,11 +369,13 @@ class Agent(nn.Module):
             self.refresh()
         with self.autocast():
             embedded = self.memory.embed(self.encoder(observation))
+        with self.autocast_after_embedding():
             memory_output = self.memory(embedded if rows is None else embedded.index_select(0, rows), minibatch)
             hidden = self.body(memory_output)
             logits, value = self.policy(hidden), self.value(hidden)
-            frame = self.reconstruction(memory_output) if self.reconstruction is not None else None
             truth = self.ground_truth(memory_output) if self.ground_truth is not None else None
+        with self.autocast():
+            frame = self.reconstruction(memory_output) if self.reconstruction is not None else None
         return AgentOutput([branch.log_softmax(-1) for branch in logits], value, frame, truth)
 
     def to_tensors(self, observation: RawObservation) -> Observation:
@@ -432,10 +435,21 @@ class Agent(nn.Module):
             return encoded if weights.embedding is None else linear_relu(encoded, weights.embedding)
 
     def autocast(self) -> contextlib.AbstractContextManager[Any]:
-        """The autocast context in which the network computes."""
+        """The autocast context of the encoder, the embedding and the reconstruction."""
         if not self.settings.bf16:
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, torch.bfloat16)
+
+    def autocast_after_embedding(self) -> contextlib.AbstractContextManager[Any]:
+        """The autocast context of the other layers."""
+        return contextlib.nullcontext() if self._is_float32_after_embedding else self.autocast()
+
+    @property
+    def _is_float32_after_embedding(self) -> bool:
+        """Whether bfloat16 ends with the embedding: on the CPU, converting the small layers around a recurrent memory costs more
+        than it saves.
+        """
+        return self.device.type == "cpu" and isinstance(self.memory, RecurrentMemory)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Agent:
         # PyTorch calls this when the parameters move, for example to another device.

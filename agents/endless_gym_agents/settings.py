@@ -227,7 +227,8 @@ class Settings:
     """compile the network with `torch.compile`; on CUDA in the mode `reduce-overhead`, which replays CUDA graphs. The first
     updates then take minutes longer"""
     bf16: bool = False
-    """bfloat16 autocast for the network; weights and losses stay float32"""
+    """bfloat16 autocast for the network; weights and losses stay float32. On the CPU, recurrent agents use it for the encoder and
+    the embedding only"""
     run: str = ""
     """folder of the run; empty for runs/ENV/AGENT-SEED-TIME"""
     resume: str = ""

@@ -6,11 +6,12 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 from agents_helpers import BRANCHES, changed, make, settings
+from operations import Products
 
 from endless_gym import make_vec, spec
 from endless_gym_agents import curves
 from endless_gym_agents.agent import Agent, make_agent
-from endless_gym_agents.encoders import FRAMES_PER_CHUNK, AtariEncoder
+from endless_gym_agents.encoders import FRAME, FRAMES_PER_CHUNK, AtariEncoder
 from endless_gym_agents.heads import PolicyHead, ReconstructionHead
 from endless_gym_agents.settings import PRESETS, Recurrence, Transformer, from_dict, to_dict
 from endless_gym_agents.train import parse
@@ -335,3 +336,30 @@ def test_flags_override_the_preset() -> None:
     assert parse(["--preset", "old"]) == PRESETS["old"]
     given = parse(["--preset", "old", "--agent", "lstm", "--ppo.gamma", "0.9"])
     assert given == changed(PRESETS["old"], agent="lstm", ppo={"gamma": 0.9})
+
+
+@pytest.mark.parametrize("agent", ["gru", "lstm", "mingru", "trxl", "none"])
+def test_on_the_cpu_bfloat16_ends_before_a_recurrent_memory(agent: str) -> None:
+    shapes = {FRAME: (84, 84, 3)}
+    model = {"body_width": 20, "head_width": 11}
+    made = make(agent, shapes, bf16=True, model=model, recurrence={"kernels": "torch"})
+    observed = {FRAME: torch.randint(256, (6, 84, 84, 3), dtype=torch.uint8)}
+    memory, is_recurrent = made.initial_memory(6), agent not in ("trxl", "none")
+    late = {torch.float32 if is_recurrent else torch.bfloat16}
+    # The first convolution, and the layer after the convolutions.
+    early = {32 * 3 * 8 * 8: {torch.bfloat16}, 3136 * (20 if agent == "none" else 16): {torch.bfloat16}}
+    gates = {"gru": 3, "lstm": 4, "mingru": 2}.get(agent)
+    expected = early | ({16 * 20: late} if agent != "none" else {}) | ({gates * 16 * 16: late} if gates else {})
+    with Products() as acting:
+        made.act(observed, memory)
+    assert acting.types.items() >= (expected | {20 * 22: late}).items()
+    done = torch.zeros((6, 1), dtype=torch.bool)
+    memory = made.initial_memory(1)
+    made.memory.begin_segment(memory.state, 6)
+    for step in range(6):
+        made.act({FRAME: observed[FRAME][step : step + 1]}, memory)
+    (minibatch,) = made.memory.minibatches([memory.state], done, 1, torch.Generator())
+    with Products() as learning:
+        made({FRAME: observed[FRAME][minibatch.indices]}, minibatch)
+    assert learning.types.items() >= (expected | {20 * 11: late, 11: late}).items()
+    assert all(parameter.dtype == torch.float32 for parameter in made.parameters())
