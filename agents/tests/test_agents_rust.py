@@ -1,6 +1,7 @@
 """Runs of `endless learn`, the trainer in Rust: the same numbers as those of the Python agents, which read them."""
 
 import json
+import re
 import signal
 import struct
 import subprocess
@@ -29,7 +30,8 @@ from endless_gym_agents.train import parse, train
 
 FLAGS = "--environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 16 --recurrence.sequence-length 6 "
 FLAGS += "--recurrence.hidden-size 16 --model.head-width 8 --ppo.minibatches 1 --no-stop-when-learnt --keep-checkpoints"
-PROGRAM = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())", "learn"]
+ENDLESS = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())"]
+PROGRAM = [*ENDLESS, "learn"]
 
 
 def learn(arguments: str, fails: bool = False) -> str:
@@ -61,6 +63,7 @@ def noise_of(seed: int, update: int, shape: tuple[int, ...]) -> Tensor:
         "--agent gru --recurrence.layers 2 --recurrence.residual",
         "--agent gru --ppo.advantage-normalisation none --recurrence.no-embedding",
         "--agent mingru --recurrence.layers 2 --ppo.advantage-normalisation batch",
+        "--agent none --recurrence.layers 2",
     ],
 )
 def test_one_update_equals_that_of_the_python_agents(
@@ -177,3 +180,51 @@ def test_signals_end_a_run_with_a_checkpoint_and_a_killed_one_resumes(tmp_path: 
     with locked(run):
         assert "in use by process" in learn(f"--resume {run} --ppo.updates 1", fails=True)
     assert f"{updates} of 1 updates done" in learn(f"--resume {run} --ppo.updates 1")
+
+
+@contextmanager
+def serving(name: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
+    """A process that serves the environments of `FLAGS` in two groups, with the training seeds of the first seed."""
+    flags += ("--num-envs", "4", "--groups", "2", "--option", "command_count=[1]", "--seed-range", "0..100000")
+    command = [*ENDLESS, "serve", "--env", "MortarMayhem-Grid-v0", "--service", name, "--seed", "1", *flags]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def test_a_run_in_a_served_engine_outlives_the_engine(tmp_path: Path) -> None:
+    name, run = f"learn-{tmp_path.name}", tmp_path / "run"
+    flags = ["--features", "--no-frames", "--autoreset", "same-step"]
+    learning = FLAGS.replace("--environment.option command_count=[1] --environment.num-envs 8 ", "").split()
+    command = [
+        *PROGRAM,
+        "MortarMayhem-Grid-v0",
+        "--connect",
+        name,
+        *learning,
+        "--ppo.updates",
+        "1000000",
+        "--run",
+        str(run),
+    ]
+    with serving(name, *flags) as engine:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            while " steps " not in process.stdout.readline():
+                assert process.poll() is None, process.stderr and process.stderr.read()
+            engine.kill()
+            errors = process.communicate(timeout=60)[1]
+        saved = checkpoint.load(run).update
+        assert process.returncode == 1 and saved > 0 and len(read_progress(run)) == saved
+        assert re.fullmatch(
+            rf"endless: engine `{name}` .* has ended; .*after update {saved}; continue with: .*\n", errors
+        )
+    learn(f"--resume {run} --ppo.updates {saved + 2}")
+    expected = new_run(tmp_path / "expected", f"--ppo.updates {saved + 2} --environment.groups 2")
+    resumed, undisturbed = (checkpoint.load(each).agent.state_dict() for each in (run, expected))
+    assert all(torch.equal(weights, resumed[name]) for name, weights in undisturbed.items())
+    with serving(name):
+        error = learn(f"MortarMayhem-Grid-v0 --connect {name} --run {tmp_path / 'other'}", fails=True)
+    assert "must serve 2 groups of 4 environments MortarMayhem-Grid-v0 with autoreset same_step" in error

@@ -1,7 +1,7 @@
 //! What a learner computes on the CPU, with gradients: layers (fully connected, GRU, LSTM, minGRU, layer normalisation), categorical
-//! policies, the losses of PPO, AdamW, and orthogonal initial weights.
+//! policies, the losses of PPO, AdamW, orthogonal initial weights, and the [`network`] of an agent made of these layers.
 //!
-//! Each module has the functions `forward` and `backward` of one layer, with its equations. The caller owns all memory: weights,
+//! The module of a layer has the functions `forward` and `backward`, with its equations. The caller owns all memory: weights,
 //! outputs, gradients, and workspaces, which grow in the first call. Later calls with the same shapes do not allocate. Numbers are
 //! f32, and matrices are stored row by row.
 //!
@@ -19,6 +19,7 @@ pub mod linear;
 pub mod lstm;
 pub mod matrix;
 pub mod mingru;
+pub mod network;
 pub mod orthogonal;
 pub mod ppo;
 pub mod sequences;

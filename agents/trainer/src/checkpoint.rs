@@ -14,9 +14,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, file};
 use crate::metrics::Episode;
-use crate::network::Network;
-use crate::rollout::Player;
+use crate::rollout::State;
 use crate::settings::Settings;
+use endless_gym_kernels::network::{Network, Tensor};
 
 /// Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed.
 const VERSION: u32 = 1;
@@ -41,33 +41,31 @@ struct Header {
 ///
 /// # Errors
 ///
-/// [`Error::File`], as on a full disk; the former checkpoint stays the last one. The errors of the environments.
-#[allow(clippy::too_many_arguments)]
+/// [`Error::File`], as on a full disk; the former checkpoint stays the last one.
 pub fn save(
     run: &Path,
     settings: &Settings,
     (update, steps): (u64, u64),
     network: &Network,
     optimizer: &AdamW,
-    player: &mut Player,
+    state: &State,
     keep: bool,
 ) -> Result<(), Error> {
     let (mean, square, optimizer_updates) = optimizer.state();
-    let episodes = player.episodes.iter().cloned().collect();
+    let episodes = state.episodes.iter().cloned().collect();
     let header = Header { version: VERSION, update, steps, optimizer_updates, episodes, settings: settings.clone() };
     let header = serde_json::to_string(&header).map_err(Error::json(METADATA))?;
-    let snapshots = player.environments.snapshots()?;
-    let lengths: Vec<u64> = snapshots.iter().map(|snapshot| snapshot.len() as u64).collect();
+    let lengths: Vec<u64> = state.snapshots.iter().map(|snapshot| snapshot.len() as u64).collect();
     let (snapshots, starts) =
-        (snapshots.concat(), player.starts.iter().map(|start| u8::from(*start)).collect::<Vec<_>>());
+        (state.snapshots.concat(), state.starts.iter().map(|start| u8::from(*start)).collect::<Vec<_>>());
 
     let floats = |name: &str, numbers: &[f32], shape: Vec<usize>| {
         (name.to_owned(), Dtype::F32, shape, bytemuck::cast_slice(numbers).to_vec())
     };
     let weights =
         network.tensors.iter().map(|t| floats(&t.name, &network.parameters[t.range.clone()], t.shape.clone()));
-    let hidden = player.hidden.iter().enumerate().map(|(layer, hidden)| {
-        floats(&format!("state/hidden/{layer}"), hidden, vec![starts.len(), network.hidden_size])
+    let hidden = state.hidden.iter().enumerate().map(|(layer, hidden)| {
+        floats(&format!("state/hidden/{layer}"), hidden, vec![starts.len(), network.spec.hidden_size])
     });
     let others = [
         floats("state/optimizer/mean", mean, vec![mean.len()]),
@@ -151,34 +149,38 @@ impl Checkpoint {
         Ok(tensor.data().chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned).collect())
     }
 
-    /// Sets the weights of a network.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Checkpoint`] if a weight is missing, has another shape, or is not finite.
-    fn load_weights(&self, tensors: &SafeTensors<'_>, network: &mut Network) -> Result<(), Error> {
-        for tensor in network.tensors.clone() {
-            let weights: Vec<f32> = self.numbers(tensors, &tensor.name, Dtype::F32, &tensor.shape)?;
-            if weights.iter().any(|weight| !weight.is_finite()) {
-                return Err(self.wrong(format!("has weights that are not finite, in {}", tensor.name)));
+    /// Sets the weights of a network, and returns the names of those that are missing or have other shapes. With `all`, and in the
+    /// memory and the body, that is an error.
+    fn load_weights(&self, tensors: &SafeTensors<'_>, network: &mut Network, all: bool) -> Result<Vec<String>, Error> {
+        let mut missing = Vec::new();
+        for Tensor { name, shape, range } in network.tensors.clone() {
+            match self.numbers::<f32>(tensors, &name, Dtype::F32, &shape) {
+                Ok(weights) if weights.iter().all(|weight| weight.is_finite()) => {
+                    network.parameters[range].copy_from_slice(&weights);
+                }
+                Ok(_) => return Err(self.wrong(format!("has weights that are not finite, in {name}"))),
+                Err(error) if all || ["memory.", "body."].iter().any(|part| name.starts_with(part)) => {
+                    return Err(error);
+                }
+                Err(_) => missing.push(name),
             }
-            network.parameters[tensor.range].copy_from_slice(&weights);
         }
         network.pack();
-        Ok(())
+        Ok(missing)
     }
 
-    /// Sets the state of a run with the same settings, and returns the number of updates and of steps so far.
+    /// Sets weights and optimizer of a run with the same settings. Returns the number of updates and of steps so far, and the state
+    /// of the environments.
     ///
     /// # Errors
     ///
-    /// [`Error::Checkpoint`] if it does not fit, and the errors of the environments.
+    /// [`Error::Checkpoint`] if it does not fit.
     pub fn resume(
         &self,
         network: &mut Network,
         optimizer: &mut AdamW,
-        player: &mut Player,
-    ) -> Result<(u64, u64), Error> {
+        num_envs: usize,
+    ) -> Result<(u64, u64, State), Error> {
         let tensors = self.tensors()?;
         let metadata = SafeTensors::read_metadata(&self.content).map_err(|error| self.wrong(error.to_string()))?.1;
         let text = metadata.metadata().as_ref().and_then(|entries| entries.get(METADATA));
@@ -187,35 +189,23 @@ impl Checkpoint {
         if header.version != VERSION {
             return Err(self.wrong(format!("must be of version {VERSION}, got {}", header.version)));
         }
-        self.load_weights(&tensors, network)?;
+        self.load_weights(&tensors, network, true)?;
         let count = [network.parameters.len()];
         let mean = self.numbers(&tensors, "state/optimizer/mean", Dtype::F32, &count)?;
         let square = self.numbers(&tensors, "state/optimizer/square", Dtype::F32, &count)?;
         *optimizer = AdamW::from_state(mean, square, header.optimizer_updates);
-        let num_envs = player.starts.len();
-        for (layer, hidden) in player.hidden.iter_mut().enumerate() {
-            let shape = [num_envs, network.hidden_size];
-            *hidden = self.numbers(&tensors, &format!("state/hidden/{layer}"), Dtype::F32, &shape)?;
-        }
+        let shape = [num_envs, network.spec.hidden_size];
+        let hidden = |layer| self.numbers(&tensors, &format!("state/hidden/{layer}"), Dtype::F32, &shape);
+        let hidden = (0..network.spec.layers).map(hidden).collect::<Result<_, _>>()?;
         let starts: Vec<u8> = self.numbers(&tensors, "state/starts", Dtype::U8, &[num_envs])?;
-        player.starts = starts.iter().map(|start| *start != 0).collect();
-        player.episodes = header.episodes.into();
         let lengths: Vec<u64> = self.numbers(&tensors, "state/lengths", Dtype::U64, &[num_envs])?;
         let total = lengths.iter().try_fold(0, |sum: usize, length| sum.checked_add(usize::try_from(*length).ok()?));
         let total = total.ok_or_else(|| self.wrong("has invalid lengths of snapshots"))?;
         let bytes: Vec<u8> = self.numbers(&tensors, "state/environments", Dtype::U8, &[total])?;
-        let mut rest = &bytes[..];
-        let snapshots = lengths.iter().map(|length| {
-            let (snapshot, after) = rest.split_at(*length as usize);
-            rest = after;
-            snapshot.to_vec()
-        });
-        let snapshots: Vec<_> = snapshots.collect();
-        player.environments.restore(&snapshots)?;
-        for group in 0..player.environments.groups {
-            player.environments.receive(group)?;
-        }
-        Ok((header.update, header.steps))
+        let mut rest = bytes.into_iter();
+        let snapshots = lengths.iter().map(|length| rest.by_ref().take(*length as usize).collect()).collect();
+        let starts = starts.iter().map(|start| *start != 0).collect();
+        Ok((header.update, header.steps, State { hidden, starts, episodes: header.episodes.into(), snapshots }))
     }
 
     /// Copies weights into a new network; the encoder and the heads keep theirs where shapes differ. Returns a line of text that says
@@ -225,20 +215,7 @@ impl Checkpoint {
     ///
     /// [`Error::Checkpoint`] if the memories or the layers after them differ.
     pub fn start(&self, network: &mut Network) -> Result<String, Error> {
-        let (tensors, mut missing) = (self.tensors()?, Vec::new());
-        for tensor in network.tensors.clone() {
-            match self.numbers::<f32>(&tensors, &tensor.name, Dtype::F32, &tensor.shape) {
-                Ok(weights) if weights.iter().all(|weight| weight.is_finite()) => {
-                    network.parameters[tensor.range].copy_from_slice(&weights);
-                }
-                Ok(_) => return Err(self.wrong(format!("has weights that are not finite, in {}", tensor.name))),
-                Err(error) if ["memory.", "body."].iter().any(|part| tensor.name.starts_with(part)) => {
-                    return Err(error);
-                }
-                Err(_) => missing.push(tensor.name),
-            }
-        }
-        network.pack();
+        let missing = self.load_weights(&self.tensors()?, network, false)?;
         let (all, path) = (network.tensors.len(), self.path.display());
         let others =
             if missing.is_empty() { String::new() } else { format!("; newly initialised: {}", missing.join(", ")) };

@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use endless_gym_core::batch::{Batch, BatchBuffer, BatchSection, Section};
 use endless_gym_core::envs::{EnvSpec, ObservationSpace};
-use endless_gym_core::pool::{Autoreset, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym_core::pool::{
+    Autoreset, Pool, PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, Seeding, Threads,
+};
 use endless_gym_service::{BatchLease, Trainer};
 
 use crate::error::Error;
@@ -39,7 +41,7 @@ enum Stepping {
 ///
 /// [`Error::Unsupported`], or an unknown id or reset parameter.
 pub fn pool_config(registry: &Registry, settings: &Settings) -> Result<PoolConfig, Error> {
-    let spec = registry.spec(&settings.env)?;
+    let spec = registry.spec(&settings.env).map_err(PoolError::from)?;
     let unsupported = |what| Err(Error::Unsupported { id: spec.id.to_owned(), what });
     if spec.action_space.branches().is_empty() {
         return unsupported("its actions are real numbers; the agents choose among discrete actions");
@@ -89,7 +91,7 @@ impl Environments {
     /// [`Error::Settings`] if it serves others.
     pub fn served(registry: &Registry, settings: &Settings, trainer: Trainer) -> Result<Self, Error> {
         let (served, config) = (trainer.specification(), pool_config(registry, settings)?);
-        let features = registry.spec(&settings.env)?.features.len();
+        let features = registry.spec(&settings.env).map_err(PoolError::from)?.features.len();
         let expected = (&*config.id, config.num_envs, settings.environment.groups, config.autoreset, features);
         let features = served.batch.section(BatchSection::Features).map_or(0, Section::width);
         let given = (&*served.id, served.num_envs, served.groups, served.autoreset, features);
@@ -106,7 +108,7 @@ impl Environments {
     }
 
     fn new(registry: &Registry, settings: &Settings, place: Stepping) -> Result<Self, Error> {
-        let (spec, wanted) = (registry.spec(&settings.env)?.clone(), &settings.environment);
+        let (spec, wanted) = (registry.spec(&settings.env).map_err(PoolError::from)?.clone(), &settings.environment);
         Ok(Environments { spec, groups: wanted.groups, per_group: wanted.num_envs / wanted.groups, place })
     }
 

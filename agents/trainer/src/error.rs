@@ -4,7 +4,6 @@ use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use endless_gym_core::envs::{ParameterError, UnknownEnvironment};
 use endless_gym_core::pool::{PoolError, SnapshotError};
 use endless_gym_service::ServiceError;
 use thiserror::Error;
@@ -73,6 +72,16 @@ pub enum Error {
         /// The update of the last checkpoint.
         saved: u64,
     },
+    /// The environments failed, such as an engine that ended. The run is saved.
+    #[error("{error}; the run is saved after update {update}; continue with: endless learn --resume {}", run.display())]
+    Saved {
+        /// What failed.
+        error: Box<Error>,
+        /// The update of the checkpoint.
+        update: u64,
+        /// The folder of the run.
+        run: PathBuf,
+    },
     /// A file cannot be read or written.
     #[error("{}: {source}", path.display())]
     File {
@@ -90,19 +99,13 @@ pub enum Error {
         source: serde_json::Error,
     },
     /// The threads cannot be started.
-    #[error("cannot start --threads {count}: {reason}")]
+    #[error("cannot start --threads {count}: {source}")]
     Threads {
         /// Number of threads.
         count: usize,
         /// Why not.
-        reason: String,
+        source: rayon::ThreadPoolBuildError,
     },
-    /// The environment id is unknown.
-    #[error(transparent)]
-    UnknownEnvironment(#[from] UnknownEnvironment),
-    /// A reset parameter is invalid.
-    #[error(transparent)]
-    Parameter(#[from] ParameterError),
     /// The environments report an error.
     #[error(transparent)]
     Pool(#[from] PoolError),

@@ -35,11 +35,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use checkpoint::Checkpoint;
+use endless_gym_kernels::network::Network;
 use environments::Environments;
 use error::{Error, file};
 use logs::{Logger, print};
-use network::Network;
-use rollout::{Clock, Player, Purpose, RECENT, generator};
+use rollout::{Clock, Player, Purpose, RECENT, State, generator};
 use run_folder::RunFolder;
 use settings::{SETTINGS, Settings};
 use threads::Threads;
@@ -55,7 +55,8 @@ use update::Learner;
 ///
 /// # Errors
 ///
-/// [`Error`] says what. After [`Error::Diverged`] and the errors of environments, the last checkpoint is from before.
+/// [`Error`] says what. After [`Error::Diverged`], the last checkpoint is from before. If the environments fail, the run is saved as it
+/// was after the last update, which is [`Error::Saved`].
 pub fn learn(
     settings: &Settings,
     environments: impl FnOnce(&Settings) -> Result<Environments, Error>,
@@ -69,15 +70,18 @@ pub fn learn(
         settings.check_resumable(&settings::read(run)?)?;
     }
     let kept = Settings { resume: String::new(), run: run.to_string_lossy().into_owned(), ..settings.clone() };
+    let num_envs = settings.environment.num_envs;
     let (threads, started) = (Threads::new(settings.threads)?, Instant::now());
     let environments = environments(&settings)?;
     let mut random = generator(settings.seed, Purpose::Weights, 0);
-    let mut network = Network::new(&settings, environments.observation_width(), &environments.choices(), &mut random);
+    let mut network = network::new(&settings, environments.observation_width(), environments.choices(), &mut random);
     let mut learner = Learner::new(network.parameters.len());
-    let mut player = Player::new(&settings, &network, environments)?;
+    let mut player = Player::new(&settings, &network, &threads, environments)?;
     let (mut update, mut steps) = (0, 0);
     if is_resumed {
-        (update, steps) = Checkpoint::read(run)?.resume(&mut network, &mut learner.optimizer, &mut player)?;
+        let state;
+        (update, steps, state) = Checkpoint::read(run)?.resume(&mut network, &mut learner.optimizer, num_envs)?;
+        player.restore(state)?;
     } else if !settings.init_from.is_empty() {
         print(Checkpoint::read(Path::new(&settings.init_from))?.start(&mut network)?);
     }
@@ -85,11 +89,12 @@ pub fn learn(
     let mut logger = Logger::open(run, settings.ppo.updates, update)?;
     let text = serde_json::to_string_pretty(&kept).map_err(Error::json(SETTINGS))?;
     std::fs::write(run.join(SETTINGS), text + "\n").map_err(file(&run.join(SETTINGS)))?;
-    let save = |counts, network: &Network, learner: &Learner, player: &mut Player, keep: bool| {
-        checkpoint::save(run, &kept, counts, network, &learner.optimizer, player, keep)
+    let save = |counts, network: &Network, learner: &Learner, state: &State, keep: bool| {
+        checkpoint::save(run, &kept, counts, network, &learner.optimizer, state, keep)
     };
+    let mut state = player.state()?;
     if !is_resumed {
-        save((update, steps), &network, &learner, &mut player, settings.keep_checkpoints)?;
+        save((update, steps), &network, &learner, &state, settings.keep_checkpoints)?;
     }
     let (mut saved, mut saved_at) = (update, Instant::now());
     let (env, parameters, threads_count) = (&settings.env, network.parameters.len(), threads.count);
@@ -100,7 +105,14 @@ pub fn learn(
     let mut is_done = update >= settings.ppo.updates;
     while !is_done {
         let (begin, mut clock) = (Instant::now(), Clock::default());
-        player.collect(&network, &threads, update, &mut clock)?;
+        // The weights are still those with which the segment began, so a failed engine loses nothing but the segment.
+        state = match player.collect(&network, &threads, update, &mut clock).and_then(|()| player.state()) {
+            Ok(state) => state,
+            Err(error) => {
+                save((update, steps), &network, &learner, &state, false)?;
+                return Err(Error::Saved { error: Box::new(error), update, run: run.to_owned() });
+            }
+        };
         let learning = Instant::now();
         let mut random = generator(settings.seed, Purpose::Minibatches, update);
         let metrics = learner.learn(&mut network, &player.segment, &settings, update, &mut random, &threads);
@@ -114,12 +126,12 @@ pub fn learn(
         }
         let new_steps = player.segment.values.len() as u64;
         steps += new_steps;
-        let recent = metrics::means(player.episodes.iter());
+        let recent = metrics::means(player.episodes().iter());
         let all: Vec<_> =
             recent.iter().cloned().chain(metrics.iter().map(|(name, value)| ((*name).to_owned(), *value))).collect();
         logger.update(update, steps, new_steps as f64 / begin.elapsed().as_secs_f64(), &all, clock)?;
 
-        if player.episodes.len() == RECENT {
+        if player.episodes().len() == RECENT {
             let reward = metrics::value(&recent, "episode/reward");
             reason = match settings.target_reward {
                 Some(target) => (reward >= target).then(|| format!("the mean reward is {reward:.3}")),
@@ -138,7 +150,7 @@ pub fn learn(
         is_done = is_stopped || update >= settings.ppo.updates;
         let is_planned = is_done || update % settings.checkpoint_interval == 0;
         if is_planned || is_late(settings.checkpoint_minutes, saved_at) {
-            save((update, steps), &network, &learner, &mut player, settings.keep_checkpoints && is_planned)?;
+            save((update, steps), &network, &learner, &state, settings.keep_checkpoints && is_planned)?;
             (saved, saved_at) = (update, Instant::now());
         }
     }

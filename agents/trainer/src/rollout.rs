@@ -1,6 +1,7 @@
 //! Collection of segments: T steps of N environments, each of which continues the episodes of the one before.
 
 use std::collections::VecDeque;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use endless_gym_core::random::{Generator, SeedSequence};
@@ -10,9 +11,9 @@ use endless_gym_kernels::sequences::Sequences;
 use crate::environments::Environments;
 use crate::error::Error;
 use crate::metrics::{Episode, final_infos};
-use crate::network::{Network, Pass};
 use crate::settings::Settings;
 use crate::threads::{Threads, part};
+use endless_gym_kernels::network::{Network, Pass};
 
 /// Number of most recent episodes over which means are computed.
 pub const RECENT: usize = 100;
@@ -54,24 +55,41 @@ pub struct Clock {
     pub learning: Duration,
 }
 
-/// Plays with the agent.
-pub struct Player {
-    /// The environments.
-    pub environments: Environments,
+/// What a segment continues.
+#[derive(Clone, Default)]
+pub struct State {
     /// The hidden states of each layer, (N, H) each.
     pub hidden: Vec<Vec<f32>>,
     /// Whether the next observation is the first of an episode, (N,).
     pub starts: Vec<bool>,
     /// The last episodes that ended, at most [`RECENT`].
     pub episodes: VecDeque<Episode>,
+    /// Snapshots of the N environments.
+    pub snapshots: Vec<Vec<u8>>,
+}
+
+/// Plays with the agent.
+pub struct Player {
+    /// The environments.
+    pub environments: Environments,
     /// The last segment.
     pub segment: Segment,
+    /// Between two segments: what the next one continues. Its snapshots are made by [`state`](Self::state).
+    state: State,
     steps: usize,
     sequence_length: usize,
     seed: u64,
     options: endless_gym_core::pool::OptionMap,
-    passes: Vec<Pass>,
+    /// The parts of each group that threads compute.
+    parts: Vec<Vec<Part>>,
     sent: Vec<i32>,
+}
+
+/// Environments that one thread computes.
+struct Part {
+    /// Numbers among the environments of all groups.
+    envs: Range<usize>,
+    pass: Pass,
 }
 
 impl Player {
@@ -80,25 +98,61 @@ impl Player {
     /// # Errors
     ///
     /// Those of the environments.
-    pub fn new(settings: &Settings, network: &Network, mut environments: Environments) -> Result<Self, Error> {
-        let num_envs = settings.environment.num_envs;
+    pub fn new(
+        settings: &Settings,
+        network: &Network,
+        threads: &Threads,
+        mut environments: Environments,
+    ) -> Result<Self, Error> {
+        let (num_envs, n) = (settings.environment.num_envs, environments.per_group);
+        let (count, mut parts) = (threads.count.min(n / ENVS_PER_THREAD).max(1), Vec::new());
         for group in 0..environments.groups {
             environments.reset(group)?;
             environments.receive(group)?;
+            let envs = (0..count).map(|i| part(n, i, count)).map(|envs| group * n + envs.start..group * n + envs.end);
+            parts.push(envs.map(|envs| Part { envs, pass: Pass::default() }).collect());
         }
         Ok(Player {
             environments,
-            hidden: vec![vec![0.0; num_envs * network.hidden_size]; network.layers()],
-            starts: vec![true; num_envs],
-            episodes: VecDeque::new(),
             segment: Segment::default(),
+            state: State {
+                hidden: vec![vec![0.0; num_envs * network.spec.hidden_size]; network.spec.layers],
+                starts: vec![true; num_envs],
+                ..State::default()
+            },
             steps: settings.ppo.steps,
-            sequence_length: settings.recurrence.sequence_length,
+            sequence_length: settings.sequence_length(),
             seed: settings.seed,
             options: settings.options()?,
-            passes: Vec::new(),
+            parts,
             sent: Vec::new(),
         })
+    }
+
+    /// The state between two segments.
+    ///
+    /// # Errors
+    ///
+    /// Those of the environments.
+    pub fn state(&mut self) -> Result<State, Error> {
+        self.state.snapshots = self.environments.snapshots()?;
+        Ok(self.state.clone())
+    }
+
+    /// Continues from a state.
+    ///
+    /// # Errors
+    ///
+    /// Those of the environments.
+    pub fn restore(&mut self, state: State) -> Result<(), Error> {
+        self.environments.restore(&state.snapshots)?;
+        self.state = state;
+        (0..self.environments.groups).try_for_each(|group| self.environments.receive(group))
+    }
+
+    /// The last episodes that ended, at most [`RECENT`].
+    pub fn episodes(&self) -> &VecDeque<Episode> {
+        &self.state.episodes
     }
 
     /// Collects the segment of an update, whose number decides its random numbers.
@@ -113,10 +167,10 @@ impl Player {
         update: u64,
         clock: &mut Clock,
     ) -> Result<(), Error> {
-        let (num_envs, groups) = (self.starts.len(), self.environments.groups);
-        let (rows, branches) = (self.steps * num_envs, network.choices.len());
+        let (num_envs, groups) = (self.state.starts.len(), self.environments.groups);
+        let (rows, branches) = (self.steps * num_envs, network.spec.choices.len());
         let segment = &mut self.segment;
-        segment.observations.resize(rows * network.observation_width(), 0.0);
+        segment.observations.resize(rows * network.spec.observation_width, 0.0);
         segment.actions.resize(rows * branches, 0);
         segment.log_probs.resize(rows * branches, 0.0);
         [&mut segment.values, &mut segment.rewards].into_iter().for_each(|part| part.resize(rows, 0.0));
@@ -125,7 +179,7 @@ impl Player {
         segment.stored.clear();
 
         let mut random = generator(self.seed, Purpose::Actions, update);
-        let mut noise = vec![0.0; num_envs * network.choices.iter().sum::<usize>()];
+        let mut noise = vec![0.0; num_envs * network.spec.choices.iter().sum::<usize>()];
         for step in 0..self.steps {
             // Drawn for the environments of all groups, so that actions do not depend on the groups.
             noise.fill_with(|| categorical::gumbel(random.random_f32()));
@@ -134,7 +188,7 @@ impl Player {
                     self.receive(group, step - 1, clock)?;
                 }
                 if group == 0 && step % self.sequence_length == 0 {
-                    self.segment.stored.push(self.hidden.clone());
+                    self.segment.stored.push(self.state.hidden.clone());
                 }
                 self.act(network, threads, group, step, &noise, clock)?;
             }
@@ -157,43 +211,32 @@ impl Player {
         clock: &mut Clock,
     ) -> Result<(), Error> {
         let begin = Instant::now();
-        let (num_envs, n, width) = (self.starts.len(), self.environments.per_group, network.observation_width());
-        let (branches, choices) = (network.choices.len(), network.choices.iter().sum::<usize>());
-        // Of the group among all environments, and among the rows of the segment.
-        let (envs, rows) = (group * n..(group + 1) * n, step * num_envs + group * n..step * num_envs + (group + 1) * n);
-        let segment = &mut self.segment;
-        self.environments.observe(group, &mut segment.observations[rows.start * width..rows.end * width]);
-        segment.starts[rows.clone()].copy_from_slice(&self.starts[envs.clone()]);
-        let parts = self.forward(network, threads, group, step);
-        let segment = &mut self.segment;
-        for (i, pass) in self.passes[..parts].iter_mut().enumerate() {
-            let part = part(n, i, parts);
-            let rows = rows.start + part.start..rows.start + part.end;
-            let noise = &noise[(envs.start + part.start) * choices..(envs.start + part.end) * choices];
-            let actions = &mut segment.actions[rows.start * branches..rows.end * branches];
-            categorical::log_softmax(&mut pass.logits, &network.choices);
-            categorical::sample(&pass.logits, &network.choices, Some(noise), actions);
-            let taken = &mut segment.log_probs[rows.start * branches..rows.end * branches];
-            categorical::log_prob(&pass.logits, &network.choices, actions, taken);
-            segment.values[rows].copy_from_slice(&pass.values);
-        }
+        self.forward(network, threads, group);
+        let (num_envs, choices, segment) = (self.state.starts.len(), &network.spec.choices, &mut self.segment);
         self.sent.clear();
-        let actions = &segment.actions[rows.start * branches..rows.end * branches];
-        self.sent.extend(actions.iter().map(|action| *action as i32));
+        for Part { envs, pass } in &mut self.parts[group] {
+            let rows = step * num_envs + envs.start..step * num_envs + envs.end;
+            segment.observations[times(&rows, network.spec.observation_width)].copy_from_slice(&pass.observations);
+            segment.starts[rows.clone()].copy_from_slice(&self.state.starts[envs.clone()]);
+            segment.values[rows.clone()].copy_from_slice(&pass.values);
+            let actions = &mut segment.actions[times(&rows, choices.len())];
+            categorical::log_softmax(&mut pass.logits, choices);
+            categorical::sample(&pass.logits, choices, Some(&noise[times(envs, choices.iter().sum())]), actions);
+            let taken = &mut segment.log_probs[times(&rows, choices.len())];
+            categorical::log_prob(&pass.logits, choices, actions, taken);
+            self.sent.extend(actions.iter().map(|action| *action as i32));
+        }
         clock.inference += begin.elapsed();
         let begin = Instant::now();
         self.environments.send(group, &self.sent)?;
         clock.stepping += begin.elapsed();
         let begin = Instant::now();
-        for (i, pass) in self.passes[..parts].iter().enumerate() {
-            let part = part(n, i, parts);
-            for (layer, hidden) in self.hidden.iter_mut().enumerate() {
-                let envs =
-                    (envs.start + part.start) * network.hidden_size..(envs.start + part.end) * network.hidden_size;
-                hidden[envs].copy_from_slice(pass.hidden(layer));
+        for Part { envs, pass } in &self.parts[group] {
+            for (layer, hidden) in self.state.hidden.iter_mut().enumerate() {
+                hidden[times(envs, network.spec.hidden_size)].copy_from_slice(pass.hidden(layer));
             }
+            self.state.starts[envs.clone()].fill(false);
         }
-        self.starts[envs].fill(false);
         clock.inference += begin.elapsed();
         Ok(())
     }
@@ -202,19 +245,19 @@ impl Player {
     fn receive(&mut self, group: usize, step: usize, clock: &mut Clock) -> Result<(), Error> {
         let begin = Instant::now();
         self.environments.receive(group)?;
-        let (num_envs, n) = (self.starts.len(), self.environments.per_group);
+        let (num_envs, n) = (self.state.starts.len(), self.environments.per_group);
         if let Some(batch) = self.environments.batch(group) {
             for (env, reward) in batch.reward().iter().enumerate() {
                 let (row, done) = (step * num_envs + group * n + env, batch.has_ended(env));
                 self.segment.rewards[row] = *reward as f32;
                 self.segment.dones[row] = done;
-                self.starts[group * n + env] = done;
+                self.state.starts[group * n + env] = done;
                 if done {
-                    self.episodes.push_back(final_infos(&self.environments.spec, &self.options, &batch, env));
+                    self.state.episodes.push_back(final_infos(&self.environments.spec, &self.options, &batch, env));
                 }
             }
         }
-        self.episodes.drain(..self.episodes.len().saturating_sub(RECENT));
+        self.state.episodes.drain(..self.state.episodes.len().saturating_sub(RECENT));
         clock.stepping += begin.elapsed();
         Ok(())
     }
@@ -222,50 +265,39 @@ impl Player {
     /// Estimates the values after the last step, without updating the hidden states.
     fn estimate(&mut self, network: &Network, threads: &Threads, group: usize, clock: &mut Clock) {
         let begin = Instant::now();
-        let n = self.environments.per_group;
-        let parts = self.forward(network, threads, group, self.steps);
-        for (i, pass) in self.passes[..parts].iter().enumerate() {
-            let part = part(n, i, parts);
-            self.segment.last_values[group * n + part.start..group * n + part.end].copy_from_slice(&pass.values);
+        self.forward(network, threads, group);
+        for Part { envs, pass } in &self.parts[group] {
+            self.segment.last_values[envs.clone()].copy_from_slice(&pass.values);
         }
         clock.inference += begin.elapsed();
     }
 
-    /// Computes one step of a group in parts, and returns their number. The observations are those of a step in the segment, or
-    /// after its end the current ones.
-    fn forward(&mut self, network: &Network, threads: &Threads, group: usize, step: usize) -> usize {
-        let (num_envs, n, width) = (self.starts.len(), self.environments.per_group, network.observation_width());
-        let parts = threads.count.min(n / ENVS_PER_THREAD).max(1);
-        if self.passes.len() < parts {
-            self.passes.resize_with(parts, Pass::default);
-        }
-        let mut current = Vec::new();
-        let observations = if step < self.steps {
-            &self.segment.observations[(step * num_envs + group * n) * width..][..n * width]
-        } else {
-            current.resize(n * width, 0.0);
-            self.environments.observe(group, &mut current);
-            &current
-        };
-        let (hidden, starts) = (&self.hidden, &self.starts[group * n..(group + 1) * n]);
-        threads.for_each(&mut self.passes[..parts], |i, pass| {
-            let part = part(n, i, parts);
-            copy(&mut pass.observations, &observations[part.start * width..part.end * width]);
-            pass.states.resize_with(network.layers(), Vec::new);
+    /// Computes the current step of a group, in its parts.
+    fn forward(&mut self, network: &Network, threads: &Threads, group: usize) {
+        let (first, width) = (group * self.environments.per_group, network.spec.observation_width);
+        let (environments, hidden, starts) = (&self.environments, &self.state.hidden, &self.state.starts);
+        let mut observations = vec![0.0; environments.per_group * width];
+        environments.observe(group, &mut observations);
+        threads.for_each(&mut self.parts[group], |_, Part { envs, pass }| {
+            copy(&mut pass.observations, &observations[times(&(envs.start - first..envs.end - first), width)]);
+            pass.states.resize_with(hidden.len(), Vec::new);
             for (state, hidden) in pass.states.iter_mut().zip(hidden) {
-                let size = network.hidden_size;
-                copy(state, &hidden[(group * n + part.start) * size..(group * n + part.end) * size]);
+                copy(state, &hidden[times(envs, network.spec.hidden_size)]);
             }
-            let sizes = [part.len()];
-            let sequences = Sequences::new(&sizes, &starts[part]).expect("one step of each environment");
+            let sizes = [envs.len()];
+            let sequences = Sequences::new(&sizes, &starts[envs.clone()]).expect("one step of each environment");
             network.forward(sequences, pass);
         });
-        parts
     }
 }
 
+/// The numbers of rows of this width.
+fn times(rows: &Range<usize>, width: usize) -> Range<usize> {
+    rows.start * width..rows.end * width
+}
+
 /// Replaces the content of a vector, whose memory stays.
-pub fn copy<T: Copy>(to: &mut Vec<T>, from: &[T]) {
+fn copy<T: Copy>(to: &mut Vec<T>, from: &[T]) {
     to.clear();
     to.extend_from_slice(from);
 }

@@ -5,10 +5,13 @@
 //! preset, and the settings of a run to resume, replace defaults before the command line is parsed.
 
 use std::ffi::OsString;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
+use clap::builder::RangedU64ValueParser;
 use clap::{ArgAction, Args, Command, ValueEnum};
 use endless_gym_core::pool::OptionMap;
+use endless_gym_service::ServiceSpecification;
 use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
 
@@ -32,8 +35,14 @@ pub struct Settings {
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Threads that act and learn; 0 for one per core. The results do not depend on it.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = integer(0..=1024))]
     pub threads: usize,
+    /// Train in the environments of this running engine, which decides their number, groups, reset parameters and seeds [default:
+    /// environments of its own].
+    #[arg(long, value_name = "SERVICE", default_value = "", hide_default_value = true)]
+    #[arg(conflicts_with_all = ["option", "num_envs", "groups", "engine", "num_threads"])]
+    #[serde(skip)]
+    pub connect: String,
     /// Folder of the run [default: runs/ENV/AGENT-SEED-TIME].
     #[arg(long, value_name = "FOLDER", default_value = "", hide_default_value = true)]
     pub run: String,
@@ -52,16 +61,16 @@ pub struct Settings {
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..))]
     pub checkpoint_interval: u64,
     /// Largest number of minutes between two checkpoints; 0 for no limit.
-    #[arg(long, default_value_t = 10.0, value_parser = from_zero)]
+    #[arg(long, default_value_t = 10.0, value_parser = number(FROM_ZERO))]
     pub checkpoint_minutes: f64,
     /// Keep all checkpoints, for evaluation, instead of only the last.
     #[arg(long, default_value_t = false, action = ArgAction::Set, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub keep_checkpoints: bool,
     /// Minutes after which training stops with a checkpoint; 0 for no limit.
-    #[arg(long, default_value_t = 0.0, value_parser = from_zero)]
+    #[arg(long, default_value_t = 0.0, value_parser = number(FROM_ZERO))]
     pub time_limit: f64,
     /// Stop when the mean reward of the last 100 episodes reaches this value [default: none].
-    #[arg(long, allow_negative_numbers = true, value_parser = finite)]
+    #[arg(long, allow_negative_numbers = true, value_parser = number(FINITE))]
     pub target_reward: Option<f64>,
     /// Stop when the last 100 episodes show that the task is learnt: with 90 % of the best possible reward in Mortar Mayhem, with
     /// success in 90 % of the episodes in other environments that report it. A target reward replaces it.
@@ -90,6 +99,8 @@ pub enum Agent {
     Gru,
     /// Gated recurrent units whose gates depend on the input only; faster.
     MinGru,
+    /// No memory; what it reaches shows how much of a task needs one.
+    None,
 }
 
 /// Values of the settings that are not given.
@@ -100,14 +111,6 @@ pub enum Preset {
     Quick,
     /// The final hyperparameters of the paper.
     Paper,
-}
-
-/// What an agent observes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Observation {
-    /// A vector that describes the frame.
-    Features,
 }
 
 /// Where the environments step.
@@ -138,14 +141,14 @@ pub struct Environment {
     /// Reset parameter, such as `command_count=[2]`; may be repeated [default: the environment's own].
     #[arg(long = "environment.option", value_name = "NAME=VALUE")]
     pub option: Vec<String>,
-    /// What the agent observes.
-    #[arg(long = "environment.observation", value_enum, default_value_t = Observation::Features)]
-    pub observation: Observation,
+    /// What the agent observes: a vector that describes the frame.
+    #[arg(long = "environment.observation", default_value = "features", value_parser = ["features"])]
+    pub observation: String,
     /// Number of environments in all groups.
-    #[arg(long = "environment.num-envs", default_value_t = 64, value_parser = positive)]
+    #[arg(long = "environment.num-envs", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
     pub num_envs: usize,
     /// Groups of environments. With two, an engine process steps one while the agent computes the actions for the other.
-    #[arg(long = "environment.groups", default_value_t = 1, value_parser = positive)]
+    #[arg(long = "environment.groups", default_value_t = 1, value_parser = integer(1..=MAX_COUNT))]
     pub groups: usize,
     /// Where the environments step.
     #[arg(long = "environment.engine", value_enum, default_value_t = Place::Thread)]
@@ -159,10 +162,10 @@ pub struct Environment {
 #[derive(Args, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Recurrence {
     /// Size of the hidden state.
-    #[arg(long = "recurrence.hidden-size", default_value_t = 128, value_parser = width)]
+    #[arg(long = "recurrence.hidden-size", default_value_t = 128, value_parser = integer(1..=MAX_WIDTH))]
     pub hidden_size: usize,
     /// Number of stacked recurrent layers.
-    #[arg(long = "recurrence.layers", default_value_t = 1, value_parser = layers)]
+    #[arg(long = "recurrence.layers", default_value_t = 1, value_parser = integer(1..=64))]
     pub layers: usize,
     /// Residual connection around the recurrent layers.
     #[arg(long = "recurrence.residual", default_value_t = false, action = ArgAction::Set, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
@@ -171,7 +174,7 @@ pub struct Recurrence {
     #[arg(long = "recurrence.embedding", default_value_t = true, action = ArgAction::Set, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub embedding: bool,
     /// Length of truncated BPTT in steps; longer segments are cut into sequences that start from stored hidden states.
-    #[arg(long = "recurrence.sequence-length", default_value_t = 64, value_parser = positive)]
+    #[arg(long = "recurrence.sequence-length", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
     pub sequence_length: usize,
 }
 
@@ -179,16 +182,16 @@ pub struct Recurrence {
 #[derive(Args, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Model {
     /// Units of the encoder.
-    #[arg(long = "model.vector-width", default_value_t = 64, value_parser = width)]
+    #[arg(long = "model.vector-width", default_value_t = 64, value_parser = integer(1..=MAX_WIDTH))]
     pub vector_width: usize,
     /// Units of the layer after the memory; 0 for the memory's output size.
-    #[arg(long = "model.body-width", default_value_t = 0, value_parser = natural_width)]
+    #[arg(long = "model.body-width", default_value_t = 0, value_parser = integer(0..=MAX_WIDTH))]
     pub body_width: usize,
     /// Units of the hidden layers of the policy and value heads.
-    #[arg(long = "model.head-width", default_value_t = 64, value_parser = width)]
+    #[arg(long = "model.head-width", default_value_t = 64, value_parser = integer(1..=MAX_WIDTH))]
     pub head_width: usize,
     /// Gain of the initial weights of the value head's output layer.
-    #[arg(long = "model.value-gain", default_value_t = 0.05, allow_negative_numbers = true, value_parser = finite)]
+    #[arg(long = "model.value-gain", default_value_t = 0.05, allow_negative_numbers = true, value_parser = number(FINITE))]
     pub value_gain: f64,
 }
 
@@ -202,43 +205,43 @@ pub struct Ppo {
     #[arg(long = "ppo.decay-updates", default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..))]
     pub decay_updates: u64,
     /// Rollout length: steps of each environment per update.
-    #[arg(long = "ppo.steps", default_value_t = 64, value_parser = positive)]
+    #[arg(long = "ppo.steps", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
     pub steps: usize,
     /// Epochs per update.
-    #[arg(long = "ppo.epochs", default_value_t = 3, value_parser = positive)]
+    #[arg(long = "ppo.epochs", default_value_t = 3, value_parser = integer(1..=MAX_COUNT))]
     pub epochs: usize,
     /// Minibatches per epoch.
-    #[arg(long = "ppo.minibatches", default_value_t = 4, value_parser = positive)]
+    #[arg(long = "ppo.minibatches", default_value_t = 4, value_parser = integer(1..=MAX_COUNT))]
     pub minibatches: usize,
     /// Discount factor.
-    #[arg(long = "ppo.gamma", default_value_t = 0.99, value_parser = share)]
+    #[arg(long = "ppo.gamma", default_value_t = 0.99, value_parser = number(SHARE))]
     pub gamma: f64,
     /// Lambda of generalised advantage estimation.
-    #[arg(long = "ppo.gae-lambda", default_value_t = 0.95, value_parser = share)]
+    #[arg(long = "ppo.gae-lambda", default_value_t = 0.95, value_parser = number(SHARE))]
     pub gae_lambda: f64,
     /// Clip range epsilon of the policy loss and of the value loss.
-    #[arg(long = "ppo.clip-range", default_value_t = 0.1, value_parser = above_zero)]
+    #[arg(long = "ppo.clip-range", default_value_t = 0.1, value_parser = number(ABOVE_ZERO))]
     pub clip_range: f64,
     /// Normalise advantages over the whole batch, over each minibatch, or not at all.
     #[arg(long = "ppo.advantage-normalisation", value_enum, default_value_t = Scope::Minibatch)]
     pub advantage_normalisation: Scope,
     /// Coefficient of the value loss.
-    #[arg(long = "ppo.value-coefficient", default_value_t = 0.5, value_parser = from_zero)]
+    #[arg(long = "ppo.value-coefficient", default_value_t = 0.5, value_parser = number(FROM_ZERO))]
     pub value_coefficient: f64,
     /// Initial learning rate of AdamW.
-    #[arg(long = "ppo.learning-rate", default_value_t = 1.0e-3, value_parser = from_zero)]
+    #[arg(long = "ppo.learning-rate", default_value_t = 1.0e-3, value_parser = number(FROM_ZERO))]
     pub learning_rate: f64,
     /// Learning rate after its decay.
-    #[arg(long = "ppo.final-learning-rate", default_value_t = 1.0e-4, value_parser = from_zero)]
+    #[arg(long = "ppo.final-learning-rate", default_value_t = 1.0e-4, value_parser = number(FROM_ZERO))]
     pub final_learning_rate: f64,
     /// Initial coefficient of the entropy bonus.
-    #[arg(long = "ppo.entropy-coefficient", default_value_t = 1.0e-2, value_parser = from_zero)]
+    #[arg(long = "ppo.entropy-coefficient", default_value_t = 1.0e-2, value_parser = number(FROM_ZERO))]
     pub entropy_coefficient: f64,
     /// Coefficient of the entropy bonus after its decay.
-    #[arg(long = "ppo.final-entropy-coefficient", default_value_t = 1.0e-3, value_parser = from_zero)]
+    #[arg(long = "ppo.final-entropy-coefficient", default_value_t = 1.0e-3, value_parser = number(FROM_ZERO))]
     pub final_entropy_coefficient: f64,
     /// Gradient clipping: largest global norm of the gradients.
-    #[arg(long = "ppo.max-gradient-norm", default_value_t = 0.5, value_parser = above_zero)]
+    #[arg(long = "ppo.max-gradient-norm", default_value_t = 0.5, value_parser = number(ABOVE_ZERO))]
     pub max_gradient_norm: f64,
 }
 
@@ -268,9 +271,10 @@ const PAPER: &[(&str, &str)] = &[
 /// Environment steps of one update of the paper.
 const PAPER_STEPS_PER_UPDATE: u64 = 32 * 512;
 
-/// Largest size of a layer, and largest number of layers. Beyond, a mistyped number would use up the memory of the machine.
-const MAX_WIDTH: usize = 16_384;
-const MAX_LAYERS: usize = 64;
+/// Largest size of a layer. Beyond, a mistyped number would use up the memory of the machine.
+const MAX_WIDTH: u64 = 16_384;
+/// Largest number of environments, steps or parts.
+const MAX_COUNT: u64 = u32::MAX as u64;
 
 /// The command `learn` with the defaults that the arguments name by `--preset` or `--resume`. Of an option that is given twice, the last
 /// one counts.
@@ -363,6 +367,28 @@ impl Settings {
         self.environment.option.iter().map(|given| parse(given).ok_or_else(|| wrong(given))).collect()
     }
 
+    /// Steps of a sequence, at most. Without a memory, steps are shuffled one by one.
+    pub fn sequence_length(&self) -> usize {
+        if self.agent == Agent::None { 1 } else { self.recurrence.sequence_length }
+    }
+
+    /// These settings with the environments of an engine.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Settings`] if its environments differ in their reset parameters.
+    pub fn of_engine(mut self, served: &ServiceSpecification) -> Result<Self, Error> {
+        let [options] = &served.options[..] else {
+            let (service, count) = (&served.service, served.options.len());
+            let rule = format!("engine `{service}` must have the same reset parameters in all environments");
+            return Err(Error::Settings(format!("{rule}, got {count} sets; start it with --option")));
+        };
+        let own = &mut self.environment;
+        own.option = options.iter().map(|(name, value)| format!("{name}={value}")).collect();
+        (own.num_envs, own.groups) = (served.num_envs * served.groups, served.groups);
+        Ok(self)
+    }
+
     /// These settings with the number of updates; checks what concerns several of them.
     ///
     /// # Errors
@@ -370,28 +396,31 @@ impl Settings {
     /// [`Error::Settings`].
     pub fn validated(mut self) -> Result<Self, Error> {
         self.options()?;
-        let (num_envs, groups, ppo) = (self.environment.num_envs, self.environment.groups, &self.ppo);
-        if num_envs % groups != 0 {
-            let given = format!("got {num_envs} environments and {groups} groups");
+        let Settings { environment, recurrence, model, ppo, .. } = &self;
+        let (num_envs, groups) = (environment.num_envs, environment.groups);
+        let steps = num_envs.saturating_mul(ppo.steps);
+        let error = if num_envs % groups != 0 {
             let rule = "--environment.num-envs must be a multiple of --environment.groups";
-            return Err(Error::Settings(format!("{rule}, {given}")));
-        }
-        let Some(steps) = num_envs.checked_mul(ppo.steps).filter(|steps| *steps <= u32::MAX as usize) else {
-            let given = format!("{num_envs} environments and {} steps", ppo.steps);
-            return Err(Error::Settings(format!("an update must have fewer than 2^32 steps, got {given}")));
-        };
-        if ppo.minibatches > steps {
+            format!("{rule}, got {num_envs} environments and {groups} groups")
+        } else if steps > u32::MAX as usize {
+            let given = ppo.steps;
+            format!("an update must have fewer than 2^32 steps, got {num_envs} environments and {given} steps")
+        } else if ppo.minibatches > steps {
             let given = ppo.minibatches;
-            let rule = format!("--ppo.minibatches must be 1 to {steps}, the steps of an update");
-            return Err(Error::Settings(format!("{rule}, got {given}")));
-        }
-        if self.recurrence.residual
-            && !self.recurrence.embedding
-            && self.model.vector_width != self.recurrence.hidden_size
+            format!("--ppo.minibatches must be 1 to {steps}, the steps of an update, got {given}")
+        } else if self.agent != Agent::None
+            && recurrence.residual
+            && !recurrence.embedding
+            && model.vector_width != recurrence.hidden_size
         {
-            let (hidden, width) = (self.recurrence.hidden_size, self.model.vector_width);
-            let rule = format!("--recurrence.residual needs inputs of the hidden size {hidden}, got {width}");
-            return Err(Error::Settings(format!("{rule}; add --recurrence.embedding")));
+            let (hidden, given) = (recurrence.hidden_size, model.vector_width);
+            let rule = format!("--recurrence.residual needs inputs of the hidden size {hidden}, got {given}");
+            format!("{rule}; add --recurrence.embedding")
+        } else {
+            String::new()
+        };
+        if !error.is_empty() {
+            return Err(Error::Settings(error));
         }
         let paper = self.paper_updates().saturating_mul(PAPER_STEPS_PER_UPDATE);
         let total = if self.total_steps > 0 { self.total_steps } else { paper };
@@ -439,39 +468,19 @@ impl Settings {
     }
 }
 
-/// A parser of numbers in a range.
-fn number<T: std::str::FromStr>(text: &str, range: &str, fits: impl Fn(&T) -> bool) -> Result<T, String> {
-    text.replace('_', "").parse().ok().filter(fits).ok_or_else(|| format!("must be {range}"))
+/// What is allowed for a number, in words and as a check.
+type Rule = (&'static str, fn(&f64) -> bool);
+const FINITE: Rule = ("a finite number", |x| x.is_finite());
+const FROM_ZERO: Rule = ("a finite number, 0 or more", |x| x.is_finite() && *x >= 0.0);
+const ABOVE_ZERO: Rule = ("a finite number above 0", |x| x.is_finite() && *x > 0.0);
+const SHARE: Rule = ("a number from 0 to 1", |x| (0.0..=1.0).contains(x));
+
+/// A parser of numbers.
+fn number((rule, fits): Rule) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| text.replace('_', "").parse().ok().filter(fits).ok_or_else(|| format!("must be {rule}"))
 }
 
-fn positive(text: &str) -> Result<usize, String> {
-    number(text, "an integer, 1 to 4294967295", |n| (1..=u32::MAX as usize).contains(n))
-}
-
-fn width(text: &str) -> Result<usize, String> {
-    number(text, &format!("an integer, 1 to {MAX_WIDTH}"), |n| (1..=MAX_WIDTH).contains(n))
-}
-
-fn natural_width(text: &str) -> Result<usize, String> {
-    number(text, &format!("an integer, 0 to {MAX_WIDTH}"), |n| *n <= MAX_WIDTH)
-}
-
-fn layers(text: &str) -> Result<usize, String> {
-    number(text, &format!("an integer, 1 to {MAX_LAYERS}"), |n| (1..=MAX_LAYERS).contains(n))
-}
-
-fn finite(text: &str) -> Result<f64, String> {
-    number(text, "a finite number", |n: &f64| n.is_finite())
-}
-
-fn from_zero(text: &str) -> Result<f64, String> {
-    number(text, "a finite number, 0 or more", |n: &f64| n.is_finite() && *n >= 0.0)
-}
-
-fn above_zero(text: &str) -> Result<f64, String> {
-    number(text, "a finite number above 0", |n: &f64| n.is_finite() && *n > 0.0)
-}
-
-fn share(text: &str) -> Result<f64, String> {
-    number(text, "a number from 0 to 1", |n: &f64| (0.0..=1.0).contains(n))
+/// A parser of integers.
+fn integer(range: RangeInclusive<u64>) -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(range)
 }

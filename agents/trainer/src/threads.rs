@@ -23,15 +23,10 @@ impl Threads {
     ///
     /// [`Error::Threads`] if they cannot be started.
     pub fn new(count: usize) -> Result<Self, Error> {
-        let most = 1024;
-        let reason = |text: &str| Error::Threads { count, reason: text.to_owned() };
-        let wanted = if count == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { count };
-        if wanted > most {
-            return Err(reason(&format!("at most {most}")));
-        }
-        let build = || ThreadPoolBuilder::new().num_threads(wanted).thread_name(|i| format!("learner {i}")).build();
-        let pool = (wanted > 1).then(build).transpose().map_err(|error| reason(&error.to_string()))?;
-        Ok(Threads { pool, count: wanted })
+        let count = if count == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { count };
+        let build = || ThreadPoolBuilder::new().num_threads(count).thread_name(|i| format!("learner {i}")).build();
+        let pool = (count > 1).then(build).transpose().map_err(|source| Error::Threads { count, source })?;
+        Ok(Threads { pool, count })
     }
 
     /// Calls `work` with the number of each part and the part.

@@ -6,10 +6,10 @@ use endless_gym_kernels::sequences::Sequences;
 use endless_gym_kernels::{categorical, ppo};
 
 use crate::minibatches::{Sequence, minibatches, packed, sequences, shards};
-use crate::network::{Network, Pass};
 use crate::rollout::Segment;
 use crate::settings::{Agent, Ppo, Scope, Settings};
 use crate::threads::{Threads, part};
+use endless_gym_kernels::network::{Network, Pass};
 
 /// The metrics of an update by name, in the order of the columns.
 pub type Metrics = Vec<(&'static str, f64)>;
@@ -86,7 +86,7 @@ impl Learner {
         // As the Python agents: the steps of a minGRU are independent enough that whole sequences are faster.
         let none = vec![false; segment.starts.len()];
         let cuts = if settings.agent == Agent::MinGru { &none } else { &segment.starts };
-        let all = sequences(cuts, num_envs, settings.recurrence.sequence_length);
+        let all = sequences(cuts, num_envs, settings.sequence_length());
         let (mut losses, mut norms, mut count) = ([0.0; LOSSES.len()], 0.0, 0.0);
         for _ in 0..ppo.epochs {
             for minibatch in minibatches(&all, ppo.minibatches, random) {
@@ -139,7 +139,7 @@ impl Shard {
         entropy_coefficient: f64,
     ) {
         let (num_envs, branches, width) =
-            (segment.last_values.len(), network.choices.len(), network.observation_width());
+            (segment.last_values.len(), network.spec.choices.len(), network.spec.observation_width);
         packed(&self.sequences, num_envs, &mut self.rows, &mut self.sizes);
         let (rows, pass) = (&self.rows[..], &mut self.pass);
         let steps = rows.len();
@@ -147,23 +147,23 @@ impl Shard {
         gather(rows, &segment.observations, width, &mut pass.observations);
         gather(rows, &segment.actions, branches, &mut self.actions);
         gather(rows, &segment.starts, 1, &mut self.resets);
-        pass.states.resize_with(network.layers(), Vec::new);
+        pass.states.resize_with(network.spec.layers, Vec::new);
         for (layer, state) in pass.states.iter_mut().enumerate() {
             state.clear();
             for Sequence { env, start, .. } in &self.sequences {
-                let size = network.hidden_size;
+                let size = network.spec.hidden_size;
                 // A sequence that does not start at a cut starts an episode, whose first state the resets make 0.
-                let stored = &segment.stored[start / settings.recurrence.sequence_length][layer];
+                let stored = &segment.stored[start / settings.sequence_length()][layer];
                 state.extend_from_slice(&stored[env * size..(env + 1) * size]);
             }
         }
         let sequences = Sequences::new(&self.sizes, &self.resets).expect("sequences in decreasing order of length");
         network.forward(sequences, pass);
-        categorical::log_softmax(&mut pass.logits, &network.choices);
+        categorical::log_softmax(&mut pass.logits, &network.spec.choices);
         let of = |all: &[f32]| rows.iter().map(|row| all[*row]).collect::<Vec<f32>>();
         let (mut taken, mut old_taken, mut entropies) = (vec![0.0; steps * branches], Vec::new(), vec![0.0; steps]);
-        categorical::log_prob(&pass.logits, &network.choices, &self.actions, &mut taken);
-        categorical::entropy(&pass.logits, &network.choices, &mut entropies);
+        categorical::log_prob(&pass.logits, &network.spec.choices, &self.actions, &mut taken);
+        categorical::entropy(&pass.logits, &network.spec.choices, &mut entropies);
         gather(rows, &segment.log_probs, branches, &mut old_taken);
         let mut advantages = of(&targets.advantages);
         advantages.iter_mut().for_each(|advantage| *advantage = (*advantage - mean) / deviation);
@@ -178,7 +178,14 @@ impl Shard {
         let grad_entropy = vec![(-entropy_coefficient / steps as f64) as f32; steps];
         pass.grad_logits.resize(pass.logits.len(), 0.0);
         let grad_logits = &mut pass.grad_logits;
-        categorical::backward(&pass.logits, &network.choices, &self.actions, &grad_taken, &grad_entropy, grad_logits);
+        categorical::backward(
+            &pass.logits,
+            &network.spec.choices,
+            &self.actions,
+            &grad_taken,
+            &grad_entropy,
+            grad_logits,
+        );
         network.backward(sequences, pass);
 
         let entropy = moments(&entropies).0;

@@ -8,13 +8,14 @@ use std::time::Duration;
 use clap::{Args, Command, FromArgMatches};
 use endless_gym_core::pool::PoolConfig;
 use endless_gym_core::random::Generator;
+use endless_gym_kernels::network::{Network, Pass};
 use endless_gym_kernels::sequences::Sequences;
 use endless_gym_memory_gym::memory_gym;
 use endless_gym_service::{ConnectConfig, Engine, EngineConfig, Namespace, Trainer};
 use endless_gym_trainer::environments::{Environments, pool_config};
 use endless_gym_trainer::error::Error;
 use endless_gym_trainer::learn;
-use endless_gym_trainer::network::{Network, Pass};
+use endless_gym_trainer::network;
 use endless_gym_trainer::settings::{Settings, with_defaults, with_negations};
 use safetensors::SafeTensors;
 use serde_json::Value as Json;
@@ -93,7 +94,7 @@ fn assert_same(run: &Path, other: &Path) {
 #[test]
 fn a_resumed_run_continues_with_the_same_bits() {
     let folder = Folder::new("resume");
-    for agent in ["gru", "mingru"] {
+    for agent in ["gru", "mingru", "none"] {
         let whole = folder.run(&format!("{agent}-whole"), &format!("--agent {agent}"));
         let run = folder.run(&format!("{agent}-parts"), &format!("--agent {agent} --ppo.updates 2"));
         assert!(tensors(&whole) != tensors(&run));
@@ -185,7 +186,6 @@ fn errors_say_what_is_allowed_and_leave_nothing() {
         (format!("{new} --ppo.minibatches 193"), "--ppo.minibatches must be 1 to 192"),
         (format!("{new} --environment.option x"), "must be NAME=VALUE with a JSON value"),
         (format!("{new} --environment.option colour=1"), "colour"),
-        (format!("{new} --threads 5000"), "--threads 5000: at most 1024"),
         (format!("{new} --init-from {at}/nowhere"), "nowhere does not exist"),
         (format!("{new} --init-from /dev/null"), "is damaged"),
         (format!("Nothing-v0 --run {at}/new"), "no environment `Nothing-v0`"),
@@ -195,10 +195,11 @@ fn errors_say_what_is_allowed_and_leave_nothing() {
         assert!(!folder.0.join("new").exists(), "{error}");
     }
     for (arguments, expected) in [
+        ("--threads 5000", "5000 is not in 0..=1024"),
         ("--ppo.gamma 1.5", "must be a number from 0 to 1"),
         ("--ppo.learning-rate nan", "must be a finite number, 0 or more"),
-        ("--recurrence.hidden-size 100000000", "must be an integer, 1 to 16384"),
-        ("--agent lstm", "[possible values: gru, mingru]"),
+        ("--recurrence.hidden-size 100000000", "100000000 is not in 1..=16384"),
+        ("--agent lstm", "[possible values: gru, mingru, none]"),
         ("--resume /nowhere", "no run in /nowhere; expected a folder with settings.json"),
     ] {
         let error = parse(arguments).unwrap_err();
@@ -236,16 +237,16 @@ fn presets_and_runs_to_resume_replace_defaults() {
 
 #[test]
 fn gradients_equal_finite_differences() {
-    for agent in ["gru", "mingru"] {
+    for agent in ["gru", "mingru", "none"] {
         for residual in ["", "--recurrence.residual"] {
             let settings =
                 settings(&format!("{SMALL} --agent {agent} {residual} --model.value-gain 1 --model.vector-width 5"));
             let mut random = Generator::from_seed(8);
-            let mut network = Network::new(&settings, 4, &[3, 2], &mut random);
+            let mut network = network::new(&settings, 4, vec![3, 2], &mut random);
             let (sizes, resets) = ([3, 3, 2], [true, false, false, false, true, false, false, false]);
             let sequences = Sequences::new(&sizes, &resets).unwrap();
             let mut normals = |count: usize| (0..count).map(|_| random.standard_normal() as f32).collect::<Vec<f32>>();
-            let states = vec![normals(3 * 16), normals(3 * 16)];
+            let states = (0..network.spec.layers).map(|_| normals(3 * 16)).collect();
             let (observations, grad_logits, grad_values) = (normals(8 * 4), normals(8 * 5), normals(8));
             let mut pass = Pass::default();
             (pass.observations, pass.states) = (observations, states);

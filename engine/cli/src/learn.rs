@@ -1,7 +1,9 @@
 //! `endless learn`.
 
+use std::time::Duration;
+
 use endless_gym_core::pool::Registry;
-use endless_gym_service::EngineConfig;
+use endless_gym_service::{ConnectConfig, EngineConfig, Trainer};
 use endless_gym_trainer::environments::{Environments, pool_config};
 use endless_gym_trainer::settings::{Place, Settings};
 
@@ -9,22 +11,32 @@ use super::engine_process::EngineProcess;
 use super::failure::Failure;
 use super::stop;
 
+/// Longest wait for the engine of `--connect` to start.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
+
 /// Runs `endless learn`, until the run is done or a signal stops it.
 pub fn run(registry: &Registry, settings: &Settings) -> Result<(), Failure> {
     stop::keep_ignored_hangup();
     let stop = stop::on_signal()?;
+    let mut settings = settings.clone();
     // Ends after the trainer.
     let mut engine = None;
-    if settings.environment.engine == Place::Process {
-        let (pool, wanted) = (pool_config(registry, settings)?, &settings.environment);
-        let config = EngineConfig::new("endless", pool, wanted.num_threads);
-        engine = Some(EngineProcess::start(EngineConfig { groups: wanted.groups, ..config })?);
-    }
-    let trainer = engine.as_mut().map(|engine| engine.connect(stop)).transpose()?;
+    let trainer = if !settings.connect.is_empty() {
+        let config = ConnectConfig { timeout: CONNECT_TIMEOUT, ..ConnectConfig::new(&settings.connect) };
+        let trainer = Trainer::connect(&config)?;
+        settings = settings.of_engine(trainer.specification())?;
+        Some(trainer)
+    } else if settings.environment.engine == Place::Process {
+        let (pool, wanted) = (pool_config(registry, &settings)?, &settings.environment);
+        let config = EngineConfig { groups: wanted.groups, ..EngineConfig::new("endless", pool, wanted.num_threads) };
+        Some(engine.insert(EngineProcess::start(config)?).connect(stop)?)
+    } else {
+        None
+    };
     let environments = |settings: &Settings| match trainer {
         Some(trainer) => Environments::served(registry, settings, trainer),
         None => Environments::in_process(registry, settings),
     };
-    endless_gym_trainer::learn(settings, environments, stop)?;
+    endless_gym_trainer::learn(&settings, environments, stop)?;
     Ok(())
 }
