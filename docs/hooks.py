@@ -1,7 +1,9 @@
-"""MkDocs hooks: pages from elsewhere in the repository, links to the page that plays, and a check for external files."""
+"""MkDocs hooks: pages from elsewhere in the repository, the page that plays and its colours, and a check for external files."""
 
+import html
 import os
 import re
+import shutil
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -18,6 +20,12 @@ PAGES = {
     "train/learning.md": "agents/benches/learning/README.md",
 }
 
+#: The folder of the built page that plays; none if it is not part of the site.
+PLAY = os.environ.get("ENDLESS_DOCS_PAGE")
+
+#: The picture of links to the site.
+PICTURE = "images/environments.webp"
+
 #: Scripts, pictures and style sheets from other hosts, which a page must not load.
 EXTERNAL = re.compile(
     r"""<(?:script|img|iframe|source)\b[^>]*\ssrc=["']?(?:https?:)?//"""
@@ -31,7 +39,40 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, page, content=(ROOT / source).read_text()))
         for picture in (ROOT / source).parent.glob("*.png"):
             files.append(File.generated(config, f"{Path(page).parent}/{picture.name}", abs_src_path=str(picture)))
+    files.append(File.generated(config, "palette.css", content=palette()))
     return files
+
+
+def palette() -> str:
+    """The colours of the page that plays, as variables of the theme's light and dark schemes."""
+    style = (ROOT / "engine/view/page/files/style.css").read_text()
+    colours = re.findall(r"(--[\w-]+): light-dark\((#\w+), (#\w+)\);", style)
+    if not colours:
+        raise PluginError(
+            "style.css of the page that plays has no colours of the form `--name: light-dark(#fff, #000)`"
+        )
+    schemes = {
+        "default": {name: light for name, light, _ in colours},
+        "slate": {name: dark for name, _, dark in colours},
+    }
+    return "".join(
+        f'[data-md-color-scheme="{scheme}"] {{ {" ".join(f"{name}: {colour};" for name, colour in values.items())} }}\n'
+        for scheme, values in schemes.items()
+    )
+
+
+def preview(title: str, description: str, config: MkDocsConfig, root: str) -> str:
+    """Tags for other sites that show a link to a page; `root` leads from the page to the site."""
+    picture = (config.site_url or root) + PICTURE
+    tags = {"title": title, "description": description, "type": "website", "image": picture}
+    return "".join(f'<meta property="og:{name}" content="{html.escape(text)}">\n' for name, text in tags.items())
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Add the preview."""
+    title = config.site_name if page.is_homepage else f"{page.title} - {config.site_name}"
+    root = "../" * page.url.count("/")
+    return output.replace("</head>", preview(title, config.site_description or "", config, root) + "</head>", 1)
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -59,13 +100,21 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     # A link that forms a paragraph by itself is replaced by the file's contents.
     markdown = re.sub(r"^\[([\w/.-]+\.(?:rs|py|yaml|sh))\]\([^)]*\)$", contents, markdown, flags=re.M)
     markdown = re.sub(r"(?<!!)\[([^\]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)", link, markdown)
-    if os.environ.get("ENDLESS_DOCS_PAGE"):
+    if PLAY:
         markdown = markdown.replace("<!-- play -->", '<a href="play/index.html">Play in the browser</a>')
     return markdown
 
 
 def on_post_build(config: MkDocsConfig) -> None:
-    """Check that no page loads anything from other hosts."""
+    """Add the page that plays, with a link to the site, and check that no page loads anything from other hosts."""
+    if PLAY:
+        copy = Path(config.site_dir) / "play"
+        shutil.copytree(PLAY, copy, dirs_exist_ok=True)
+        text = (copy / "index.html").read_text()
+        description = html.unescape(re.findall(r'name="description" content="([^"]*)"', text)[0])
+        text = text.replace("</head>", preview("Endless Gym: play", description, config, "../") + "</head>", 1)
+        linked = text.replace("<footer>", '<footer>\n    <p><a href="../index.html">Documentation</a></p>', 1)
+        (copy / "index.html").write_text(linked)
     for file in Path(config.site_dir).rglob("*.html"):
         if found := EXTERNAL.search(file.read_text()):
             raise PluginError(f"{file} loads something from elsewhere: {found[0]}")

@@ -31,11 +31,9 @@ pub fn build(write: bool) -> Result<(), String> {
     // Silences an announcement of Material for MkDocs.
     mkdocs.env("NO_MKDOCS_2_WARNING", "1");
     if page {
-        output(mkdocs.env("ENDLESS_DOCS_PAGE", "1"))?;
-        copy(&web::folder()?, &site.join("play"))?;
-    } else {
-        output(&mut mkdocs)?;
+        mkdocs.env("ENDLESS_DOCS_PAGE", web::folder()?);
     }
+    output(&mut mkdocs)?;
     run(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;
     copy(&target()?.join("doc"), &site.join("rust"))?;
     println!("{}", site.join("index.html").display());
