@@ -1,11 +1,13 @@
-//! Builds the files of a release in `target/dist`: the source distribution and the wheel of the Python package, and the
-//! crates.
+//! Builds the files of a release in `target/dist`: the source distribution and the wheel of the Python package, the crates, and the
+//! page that plays.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::shell::{cargo, cargo_home, describe, files_below, recreate, remap, run, sysroot, target, workspace};
+use crate::shell::{
+    cargo, cargo_home, describe, files_below, output, recreate, remap, run, sysroot, target, workspace,
+};
 use crate::{python, web};
 
 /// Maturin as in the tests. Zig links against any version of the C library.
@@ -36,11 +38,14 @@ const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
 pub fn build() -> Result<(), String> {
     let folder = folder()?;
     let tools = python::tools("packaging", &python::base()?, &TOOLS)?;
-    match web::Toolchain::find() {
-        Some(_) => web::build()?,
-        None => println!("The program will not contain the page: missing: {}", web::MISSING),
-    }
     recreate(&folder)?;
+    match web::Toolchain::find() {
+        Some(_) => {
+            web::build()?;
+            page(&folder)?;
+        }
+        None => println!("Without the page, in the program and as an archive; missing: {}", web::MISSING),
+    }
     let source = source_distribution(&tools, &folder)?;
     wheel(&tools, &source, &folder)?;
     crates()?;
@@ -68,6 +73,30 @@ fn only_file(folder: &Path, suffix: &str) -> Result<PathBuf, String> {
     }
 }
 
+/// Packs the page, for any web server and for `cargo xtask play` without a compiler for WebAssembly. The same page gives the same
+/// archive.
+fn page(folder: &Path) -> Result<(), String> {
+    let name = versioned("endless-gym-web");
+    let mut tar = Command::new("tar");
+    tar.args([
+        "--create",
+        "--gzip",
+        "--sort=name",
+        "--mtime=@0",
+        "--owner=0",
+        "--group=0",
+        "--numeric-owner",
+        "--mode=u=rwX,go=rX",
+    ]);
+    tar.arg(format!("--transform=s,^\\.,{name},")).arg("--file").arg(folder.join(format!("{name}.tar.gz")));
+    run(tar.arg("--directory").arg(web::folder()?).arg("."))
+}
+
+/// The end of the name of the source distribution, which is not that of the page.
+fn source_archive() -> String {
+    format!("endless_gym-{}.tar.gz", env!("CARGO_PKG_VERSION"))
+}
+
 /// Makes the source distribution and unpacks it. Returns the folder of its `pyproject.toml`.
 fn source_distribution(tools: &Path, folder: &Path) -> Result<PathBuf, String> {
     let manifest = workspace().join("bindings/python/Cargo.toml");
@@ -77,7 +106,7 @@ fn source_distribution(tools: &Path, folder: &Path) -> Result<PathBuf, String> {
     // The files in the archive have a fixed time. `--touch` sets the current time, so that cargo sees that they
     // changed.
     let mut tar = Command::new("tar");
-    tar.args(["--extract", "--touch", "--strip-components=1", "--file"]).arg(only_file(folder, ".tar.gz")?);
+    tar.args(["--extract", "--touch", "--strip-components=1", "--file"]).arg(only_file(folder, &source_archive())?);
     run(tar.arg("--directory").arg(&unpacked))?;
     // The lock file lists members of the workspace that the archive lacks. All other versions stay.
     run(cargo(&["update", "--quiet", "--workspace"]).current_dir(&unpacked))?;
@@ -158,6 +187,15 @@ pub fn test() -> Result<(), String> {
     build()?;
     let wheel = only_file(&folder()?, ".whl")?;
     let page = if web::Toolchain::find().is_some() { "page" } else { "no page" };
+    if page == "page" {
+        let name = versioned("endless-gym-web");
+        let archive = only_file(&folder()?, &format!("{name}.tar.gz"))?;
+        let files = output(Command::new("tar").args(["--list", "--file"]).arg(&archive))?;
+        let has = |file: &&str| files.lines().any(|line| line == format!("{name}/{file}"));
+        if let Some(missing) = ["index.html", "engine.wasm"].iter().find(|file| !has(file)) {
+            return Err(format!("{} must contain {missing}", archive.display()));
+        }
+    }
     let mut oldest = None;
     for minor in python::SUPPORTED {
         let Some(python) = python::interpreter(minor) else {
@@ -168,7 +206,7 @@ pub fn test() -> Result<(), String> {
         oldest.get_or_insert(python);
     }
     let oldest = oldest.ok_or("no CPython has been found")?;
-    install_and_use(&oldest, "source", &only_file(&folder()?, ".tar.gz")?, "no page")
+    install_and_use(&oldest, "source", &only_file(&folder()?, &source_archive())?, "no page")
 }
 
 /// Installs a package with the locked versions of its dependencies, and nothing else, into a virtual environment, and
