@@ -2,11 +2,11 @@
 
 use std::collections::VecDeque;
 
+use endless_gym::environments;
 use endless_gym_core::batch::{BatchSection, Block, Layout, Section, zeroed};
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::pool::{OptionMap, Pool, PoolError, ResetRequest, SnapshotError, Threads};
 use endless_gym_core::random::Generator;
-use endless_gym_memory_gym::memory_gym;
 use endless_gym_service::{BatchLease, ServiceError, ServiceSpecification, Trainer};
 
 use crate::options;
@@ -31,9 +31,7 @@ impl Request {
             let options = (with_options && draws.integers(0, 2) == 0).then(|| options::random(draws, &shape.id));
             return Request::Each { reset, seed, options };
         }
-        let branches = space.branches();
-        let actions = (0..num_envs).flat_map(|_| branches).map(|n| draws.integers(0, i64::from(*n)) as i32);
-        Request::Step(actions.collect())
+        Request::Step((0..num_envs).flat_map(|_| action(draws, space)).collect())
     }
 
     /// Sends it.
@@ -45,6 +43,16 @@ impl Request {
             }
             Request::Step(actions) => trainer.send(group, actions),
         }
+    }
+}
+
+/// A random action; one of a box reaches beyond narrow bounds.
+fn action(draws: &mut Generator, space: &ActionSpace) -> Vec<i32> {
+    match space {
+        ActionSpace::Box { low, .. } => {
+            low.iter().map(|_| (draws.uniform(-3.0, 3.0) as f32).to_bits().cast_signed()).collect()
+        }
+        _ => space.branches().iter().map(|n| draws.integers(0, i64::from(*n)) as i32).collect(),
     }
 }
 
@@ -61,7 +69,7 @@ pub struct Twin {
 
 impl Twin {
     pub fn new(shape: &Shape, group: usize) -> Result<Self, PoolError> {
-        let pool = Pool::new(memory_gym(), &shape.pool(group), &Threads::new(1)?)?;
+        let pool = Pool::new(environments(), &shape.pool(group), &Threads::new(1)?)?;
         let buffers = (0..3).map(|_| zeroed(pool.layout().blocks())).collect();
         let shows_history = shape.id.contains("SearingSpotlights") || shape.id.contains("Endless-MortarMayhem");
         Ok(Twin { pool, buffers, shows_history, is_exact: true })
@@ -69,7 +77,7 @@ impl Twin {
 
     /// The difference between an engine's specification and the expected one, if any.
     pub fn difference(&self, shape: &Shape, specification: &ServiceSpecification) -> Option<String> {
-        let space = memory_gym().spec(&shape.id).map(|spec| &spec.action_space).ok();
+        let space = environments().spec(&shape.id).map(|spec| &spec.action_space).ok();
         let same = specification.batch == *self.pool.layout()
             && Some(&specification.action_space) == space
             && specification.autoreset == shape.autoreset;

@@ -24,6 +24,8 @@ pub enum Event {
     Broken { what: String },
     /// A call failed.
     Error { during: String, kind: String, text: String, engine: Option<u32> },
+    /// A page has shown this many messages of the engine.
+    Shown { messages: u64 },
     /// A child process was forked.
     Forked { child: u32 },
     /// The process ended regularly.

@@ -10,6 +10,7 @@ mod faults;
 mod ledger;
 mod options;
 mod others;
+mod page;
 mod plan;
 mod report;
 mod rights;
@@ -36,7 +37,7 @@ struct Cli {
 enum Task {
     /// Kill, stop and starve processes, and check every byte.
     Faults(run::Args),
-    /// Play all environments with random options for a long time, and watch memory and descriptors.
+    /// Play all environments with random options for a long time, and watch memory, descriptors and files.
     Soak(soak::Args),
     /// Play one round in the namespace of the environment variable, and print its outcome as JSON.
     #[command(hide = true)]
@@ -69,6 +70,7 @@ fn role(name: &str, argument: &str) -> Result<(), String> {
     match name {
         "train" => return trainer::run(&parsed(argument)?),
         "observe" => others::observe(&parsed(argument)?),
+        "show" => return page::show(),
         "visit" => {
             let (seed, times) = parsed(argument)?;
             others::visit(seed, times);

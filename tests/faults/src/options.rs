@@ -1,14 +1,14 @@
 //! Random reset parameters within the limits of the parameter tables.
 
+use endless_gym::environments;
 use endless_gym_core::envs::ParameterKind;
 use endless_gym_core::pool::OptionMap;
 use endless_gym_core::random::Generator;
-use endless_gym_memory_gym::memory_gym;
 use serde_json::Value as Json;
 
 /// Some of an id's parameters with random values, usually not far from the defaults.
 pub fn random(draws: &mut Generator, id: &str) -> OptionMap {
-    let parameters = memory_gym().spec(id).map(|spec| spec.parameters).unwrap_or_default();
+    let parameters = environments().spec(id).map(|spec| spec.parameters).unwrap_or_default();
     let mut options = OptionMap::new();
     for parameter in parameters {
         if draws.random() < 0.3 {
@@ -54,7 +54,7 @@ mod tests {
         for seed in 0..60 {
             let shape = Shape::random(&mut Generator::from_seed(seed), 6);
             for group in 0..shape.groups {
-                Pool::new(memory_gym(), &shape.pool(group), &Threads::new(1).unwrap())
+                Pool::new(environments(), &shape.pool(group), &Threads::new(1).unwrap())
                     .unwrap_or_else(|e| panic!("{shape:?}: {e}"));
             }
         }

@@ -26,7 +26,7 @@ pub struct Habit {
     pub pause: i64,
 }
 
-fn stop_at_end_of_input() -> Arc<AtomicBool> {
+pub fn stop_at_end_of_input() -> Arc<AtomicBool> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&stop);
     std::thread::spawn(move || {

@@ -25,6 +25,8 @@ pub struct Outcome {
     pub batches: u64,
     /// Batches of observers compared with a trainer's.
     pub observed: u64,
+    /// Messages that pages have shown.
+    pub shown: u64,
     /// Faults that the machine does not permit, by kind.
     pub left_out: BTreeMap<String, u64>,
 }
@@ -36,6 +38,7 @@ impl Outcome {
         self.failures.extend(other.failures);
         self.batches += other.batches;
         self.observed += other.observed;
+        self.shown += other.shown;
         for (sums, counts) in [(&mut self.errors, other.errors), (&mut self.left_out, other.left_out)] {
             for (kind, count) in counts {
                 *sums.entry(kind).or_default() += count;

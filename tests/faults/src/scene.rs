@@ -279,6 +279,7 @@ impl<'a> Scene<'a> {
             Event::Wrong { what } => self.fail("wrong bytes", what),
             Event::Miscounted { what } => self.fail("lost or doubled step", what),
             Event::Broken { what } => self.fail("broken promise", what),
+            Event::Shown { messages } => self.outcome.shown += messages,
             Event::Forked { child } => self.forked = Some(child),
             Event::End => {}
             Event::Error { during, kind, text, engine } => {

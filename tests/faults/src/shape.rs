@@ -1,10 +1,10 @@
 //! What an engine serves: the arguments of `endless serve`, and the matching pools.
 
+use endless_gym::{environments, memory_gym, popgym};
 use endless_gym_core::batch::Frames;
 use endless_gym_core::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, Seeding};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::PixelFormat;
-use endless_gym_memory_gym::memory_gym;
 use serde::{Deserialize, Serialize};
 
 use crate::options;
@@ -30,7 +30,8 @@ pub struct Shape {
 impl Shape {
     /// A random shape: any id and format, options within their limits, at most `most` environments in total.
     pub fn random(draws: &mut Generator, most: i64) -> Self {
-        let specs: Vec<_> = memory_gym().specs().map(|spec| spec.id).collect();
+        let suite = if draws.integers(0, 3) == 0 { popgym() } else { memory_gym() };
+        let specs: Vec<_> = suite.specs().map(|spec| spec.id).collect();
         let id = *draws.choice(&specs);
         Shape::random_of(draws, id, most)
     }
@@ -44,6 +45,8 @@ impl Shape {
         let format = PixelFormat { grayscale: flag(), channels_first: flag(), row_major: flag() };
         let (final_observation, features, has_seed, is_stacked, has_options) = (flag(), flag(), flag(), flag(), flag());
         let stack = if is_stacked { draws.integers(2, 5) as usize } else { 1 };
+        // POPGym's observations are the features.
+        let can_paint = environments().spec(id).is_ok_and(|spec| spec.frame.is_some());
         let options = if has_options { options::random(draws, id) } else { OptionMap::new() };
         Shape {
             id: id.to_owned(),
@@ -51,8 +54,8 @@ impl Shape {
             groups: groups as usize,
             autoreset,
             final_observation: final_observation && autoreset == Autoreset::SameStep,
-            features,
-            frames: (draws.integers(0, 12) != 0).then_some(Frames { format, stack }),
+            features: features || !can_paint,
+            frames: (can_paint && draws.integers(0, 12) != 0).then_some(Frames { format, stack }),
             options,
             seed: has_seed.then(|| draws.integers(0, 1000) as u64),
         }

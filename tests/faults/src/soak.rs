@@ -1,17 +1,18 @@
-//! A long run without faults: plays all ids with random options and formats, and watches memory, descriptors and
-//! segments.
+//! A long run without faults: plays all ids with random options and formats while observers and a page watch, and
+//! measures memory, descriptors and files.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use endless_gym::environments;
 use endless_gym_core::random::Generator;
-use endless_gym_memory_gym::memory_gym;
 use endless_gym_service::Namespace;
 use serde::Serialize;
 
-use crate::actors::Actor;
+use crate::actors::{self, Actor};
 use crate::cleanliness;
 use crate::plan::{Plan, Role};
 use crate::report::Outcome;
@@ -31,7 +32,7 @@ const SEGMENTS: u64 = 8;
 /// Arguments of `soak`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Duration of the run; each of the ten ids gets a tenth of it.
+    /// Duration of the run; each id gets the same share of it.
     #[arg(long, default_value_t = 60.0)]
     minutes: f64,
     /// The seed of options, formats and actions [default: random].
@@ -47,22 +48,29 @@ pub struct Args {
 struct Usage {
     engine_memory: u64,
     trainer_memory: u64,
+    page_memory: u64,
     engine_descriptors: u64,
     trainer_descriptors: u64,
+    page_descriptors: u64,
     segments: u64,
+    files: u64,
 }
 
 impl Usage {
-    fn of(scene: &Scene<'_>) -> Self {
+    fn of(scene: &Scene<'_>, page: u32) -> Self {
         let id = |actor: &Option<Actor>| actor.as_ref().map_or(0, Actor::id);
         let (engine, trainer) = (id(&scene.engine), id(&scene.trainer));
-        let segments = cleanliness::files(&scene.namespace);
+        let (segments, files): (Vec<_>, Vec<_>) =
+            cleanliness::files(&scene.namespace).into_iter().partition(|path| path.starts_with("/dev/shm"));
         Usage {
             engine_memory: memory(engine),
             trainer_memory: memory(trainer),
+            page_memory: memory(page),
             engine_descriptors: descriptors(engine),
             trainer_descriptors: descriptors(trainer),
-            segments: segments.iter().filter(|path| path.starts_with("/dev/shm")).count() as u64,
+            page_descriptors: descriptors(page),
+            segments: segments.len() as u64,
+            files: files.len() as u64,
         }
     }
 
@@ -75,11 +83,14 @@ impl Usage {
         let usages = &usages[2 * usages.len() / 5..];
         let third = usages.len() / 3;
         let (first, last) = (&usages[..third], &usages[usages.len() - third..]);
-        let counters: [Counter; 5] = [
+        let counters: [Counter; 8] = [
             ("memory of the engine", |usage| usage.engine_memory, memory),
             ("memory of the trainer", |usage| usage.trainer_memory, memory),
+            ("memory of the page's server", |usage| usage.page_memory, memory),
             ("descriptors of the engine", |usage| usage.engine_descriptors, DESCRIPTORS),
             ("descriptors of the trainer", |usage| usage.trainer_descriptors, DESCRIPTORS),
+            ("descriptors of the page's server", |usage| usage.page_descriptors, DESCRIPTORS),
+            ("files", |usage| usage.files, SEGMENTS),
             ("segments", |usage| usage.segments, SEGMENTS),
         ];
         let grown = counters.into_iter().filter_map(|(name, counter, limit)| {
@@ -117,11 +128,14 @@ pub fn run(args: &Args) -> Result<(), String> {
     let seed = args.seed.map_or_else(random_seed, Ok)?;
     let stop = stop_on_signal()?;
     println!("seed {seed}");
-    let ids: Vec<&str> = memory_gym().specs().map(|spec| spec.id).collect();
+    let ids: Vec<&str> = environments().specs().map(|spec| spec.id).collect();
     let mut draws = Generator::from_seed(seed);
     let start = Instant::now();
     let mut phases: Vec<Phase> = Vec::new();
     for (number, id) in ids.iter().enumerate() {
+        if stop.load(Ordering::Relaxed) {
+            break;
+        }
         let end = time.mul_f64((number + 1) as f64 / ids.len() as f64);
         let plan = Plan {
             shape: Shape::random_of(&mut draws, id, 16),
@@ -134,7 +148,7 @@ pub fn run(args: &Args) -> Result<(), String> {
             steps: Vec::new(),
         };
         let namespace = new_namespace()?;
-        let must_end = || start.elapsed() >= end || stop.load(std::sync::atomic::Ordering::Relaxed);
+        let must_end = || start.elapsed() >= end || stop.load(Ordering::Relaxed);
         let phase = phase(&plan, namespace.clone(), &mut draws, start, must_end);
         cleanliness::remove_all(&namespace);
         let phase = phase?;
@@ -159,12 +173,15 @@ fn phase(
         scene.start(role)?;
     }
     scene.visitor(usize::MAX)?;
+    let page = scene.spawn(actors::role("show", &())?)?;
+    let page_id = page.id();
+    scene.others.push(page);
     let mut usages = Vec::new();
     let mut minute = start.elapsed().as_secs() / 60;
     let mut next_observer = Instant::now();
     while !must_end() {
         scene.watch(Duration::from_millis(500))?;
-        usages.push(Usage::of(&scene));
+        usages.push(Usage::of(&scene, page_id));
         if Instant::now() >= next_observer {
             // Observers end regularly or are killed.
             if draws.integers(0, 2) == 0 {
@@ -191,6 +208,10 @@ fn phase(
             scene.fail("growth", grown);
         }
     }
+    let ended: Vec<_> = scene.others.iter_mut().filter_map(|other| Some((other.ended()?, other.complaint()))).collect();
+    for (status, complaint) in ended {
+        scene.fail("unexpected end", format!("a visitor or the page: {status}: {complaint}"));
+    }
     round::end(&mut scene)?;
     scene.close();
     for left in cleanliness::leftovers(&scene.namespace) {
@@ -198,6 +219,9 @@ fn phase(
     }
     if scene.outcome.batches == 0 {
         scene.fail("no batches", "the trainer has not played".to_owned());
+    }
+    if scene.outcome.shown == 0 {
+        scene.fail("no messages", "the page has shown nothing".to_owned());
     }
     Ok(Phase {
         id: plan.shape.id.clone(),
@@ -213,28 +237,35 @@ fn steps(outcome: &Outcome, plan: &Plan) -> u64 {
 }
 
 fn print_minute(minute: u64, scene: &Scene<'_>, plan: &Plan, usage: Usage) {
-    let Usage { engine_memory, trainer_memory, engine_descriptors, trainer_descriptors, segments } = usage;
     println!(
-        "minute {minute}: {}: {} steps, {} failures; memory of engine and trainer {:.1} and {:.1} MB, descriptors \
-         {engine_descriptors} and {trainer_descriptors}, segments {segments}",
+        "minute {minute}: {}: {} steps, {} failures; of engine, trainer and page: memory {:.1}, {:.1} and {:.1} MB, \
+         descriptors {}, {} and {}; {} segments, {} files",
         plan.shape.id,
         steps(&scene.outcome, plan),
         scene.outcome.failures.len(),
-        engine_memory as f64 / 1e6,
-        trainer_memory as f64 / 1e6,
+        usage.engine_memory as f64 / 1e6,
+        usage.trainer_memory as f64 / 1e6,
+        usage.page_memory as f64 / 1e6,
+        usage.engine_descriptors,
+        usage.trainer_descriptors,
+        usage.page_descriptors,
+        usage.segments,
+        usage.files,
     );
 }
 
 fn summary(args: &Args, seed: u64, time: Duration, phases: &[Phase]) -> Result<(), String> {
     let steps: u64 = phases.iter().map(|phase| phase.steps).sum();
     let observed: u64 = phases.iter().map(|phase| phase.outcome.observed).sum();
+    let shown: u64 = phases.iter().map(|phase| phase.outcome.shown).sum();
     let failures: usize = phases.iter().map(|phase| phase.outcome.failures.len()).sum();
     let mut kinds = BTreeMap::<_, u64>::new();
     for failure in phases.iter().flat_map(|phase| &phase.outcome.failures) {
         *kinds.entry(&failure.kind).or_default() += 1;
     }
     println!(
-        "\n{steps} steps compared in {:.1} minutes, {observed} batches of observers compared",
+        "\n{steps} steps compared in {:.1} minutes, {observed} batches of observers compared, {shown} messages of \
+         pages shown",
         time.as_secs_f64() / 60.0
     );
     for (kind, count) in &kinds {
@@ -244,7 +275,7 @@ fn summary(args: &Args, seed: u64, time: Duration, phases: &[Phase]) -> Result<(
     if let Some(path) = &args.json {
         let minutes = time.as_secs_f64() / 60.0;
         let summary = serde_json::json!({
-            "seed": seed, "minutes": minutes, "steps": steps, "observed_batches_compared": observed, "failures": failures,
+            "seed": seed, "minutes": minutes, "steps": steps, "observed_batches_compared": observed, "messages_shown": shown, "failures": failures,
             "phases": phases,
         });
         fs::write(path, format!("{summary:#}\n")).map_err(|error| format!("{}: {error}", path.display()))?;
