@@ -20,13 +20,12 @@ from typing import Annotated
 
 import torch
 import tyro
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
 from endless_gym.specs import spec
-from endless_gym_agents import checkpoint, command, wrappers
+from endless_gym_agents import checkpoint, command, tables, wrappers
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
 from endless_gym_agents.ranges import Natural, Positive, Range
@@ -208,6 +207,17 @@ def probe(recording: Recording, columns: Sequence[str], seed: int = 0) -> list[S
     return found
 
 
+def table(title: str, scores: Sequence[Score]) -> Table:
+    """A table with one row for each score."""
+    texts, figures = ("ground truth", "from", "probe"), ("error", "baseline", "explained", "accuracy", "majority")
+    made = tables.table(title, dict.fromkeys(texts, False) | dict.fromkeys(figures, True))
+    for score in scores:
+        shares = ["" if share is None else f"{share:.3f}" for share in (score.accuracy, score.majority)]
+        numbers = [f"{score.error:.4f}", f"{score.baseline:.4f}", f"{score.explained:.3f}", *shares]
+        made.add_row(score.column, score.source, score.probe, *numbers)
+    return made
+
+
 def execute(arguments: ProbeArguments) -> None:
     """Record, probe, and print the scores."""
     if arguments.threads:
@@ -221,14 +231,7 @@ def execute(arguments: ProbeArguments) -> None:
         values = {"env": env_spec.id, "steps": len(recording.truth), "scores": [asdict(score) for score in scores]}
         print(json.dumps(values, indent=1))
         return
-    table = Table(title=f"{env_spec.id}, {len(recording.truth):,} steps", title_justify="left", box=box.SIMPLE)
-    for name in ("ground truth", "from", "probe", "error", "baseline", "explained", "accuracy", "majority"):
-        table.add_column(name, justify="left" if name in ("ground truth", "from", "probe") else "right")
-    for score in scores:
-        shares = ["" if share is None else f"{share:.3f}" for share in (score.accuracy, score.majority)]
-        numbers = [f"{score.error:.4f}", f"{score.baseline:.4f}", f"{score.explained:.3f}", *shares]
-        table.add_row(score.column, score.source, score.probe, *numbers)
-    Console().print(table)
+    tables.show(table(f"{env_spec.id}, {len(recording.truth):,} steps", scores), Console())
 
 
 def main() -> int:

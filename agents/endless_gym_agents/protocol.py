@@ -20,12 +20,11 @@ from typing import Annotated
 
 import torch
 import tyro
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from endless_gym_agents import checkpoint, command, metrics
+from endless_gym_agents import checkpoint, command, metrics, tables
 from endless_gym_agents.evaluate import EVALUATION_SEEDS, REPETITIONS, evaluate
 from endless_gym_agents.ranges import Natural, Positive
 from endless_gym_agents.results import Experiment, Experiments, Run, to_json
@@ -168,18 +167,15 @@ def table(experiment: Experiment) -> Table:
     # The paper calls the agent without memory by its algorithm.
     label = "none (ppo in the paper)" if experiment.label == "ppo" else experiment.label
     title = f"{experiment.env}, {label}, over {rows[0][-1]}{options}"
-    result = Table(title=title, title_justify="left", box=box.SIMPLE)
-    for name in ("steps", "metric", "mean", "std", "IQM", "95 % of IQM"):
-        result.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
     others = [name for name in experiment.runs[0].metrics if name != first]
     rows += [(name, *row) for name in others for row in experiment.summaries(name)[-1:]]
     doubtful = set(metrics.counts_failures(experiment.env)).intersection(others)
-    if doubtful:
-        result.caption = (
-            f"Trust {first}. * as the original reports it: a last command that failed counts as executed, so that an agent "
-            "that fails can reach 1.0."
-        )
-        result.caption_justify = "left"
+    caption = (
+        f"Trust {first}. * as the original reports it: a last command that failed counts as executed, so that an agent "
+        "that fails can reach 1.0."
+    )
+    columns = {name: name != "metric" for name in ("steps", "metric", "mean", "std", "IQM", "95 % of IQM")}
+    result = tables.table(title, columns, caption if doubtful else "")
     for name, step, summary, _ in rows:
         name = f"{name} *" if name in doubtful else name
         interval = f"{summary.low:.4f} {summary.high:.4f}"
@@ -213,7 +209,7 @@ def execute(arguments: EvalArguments) -> None:
             Path(arguments.json).write_text(json.dumps(written) + "\n")
         console = Console()
         for experiment in experiments:
-            console.print(table(experiment))
+            tables.show(table(experiment), console)
     if failed:
         raise ValueError(f"the others are evaluated; {'; '.join(failed)}")
 

@@ -23,11 +23,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich import box
-from rich.console import Console
 from rich.table import Table
 
-from endless_gym_agents import command, ray_session
+from endless_gym_agents import command, ray_session, tables
 from endless_gym_agents.clock import duration
 from endless_gym_agents.experiments import definitions, planning, running, running_ray
 from endless_gym_agents.experiments.definitions import Experiment
@@ -78,10 +76,8 @@ class ReproduceArguments:
 
 def listed(experiments: list[Experiment], scale: float) -> Table:
     """A table of experiments at a scale; the column `runs` shows the number of runs times the number of seeds."""
-    table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for name in ("name", "paper", "runs", "updates", "title"):
-        right = name in ("runs", "updates")
-        table.add_column(name, justify="right" if right else "left", no_wrap=True)
+    names = ("name", "paper", "runs", "updates", "title")
+    table = tables.table("", {name: name in ("runs", "updates") for name in names})
     for experiment in experiments:
         values = planning.as_json(experiment, scale)
         updates = sorted({row["updates"] for row in values["runs"]})
@@ -116,8 +112,7 @@ def execute(arguments: ReproduceArguments) -> None:
         if arguments.json:
             print(json.dumps([planning.as_json(experiment, scale) for experiment in experiments], indent=1))
         else:
-            # Do not truncate names and numbers in narrow terminals or pipes.
-            Console(highlight=False, width=max(console.width, 120)).print(listed(experiments, scale))
+            tables.show(listed(experiments, scale), console)
         return
     machine, out = machine_of(arguments), arguments.out
     if arguments.ray:

@@ -20,11 +20,9 @@ from pathlib import Path
 from typing import IO, Annotated, Any, Literal
 
 import tyro
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
-from endless_gym_agents import checkpoint, ranges
+from endless_gym_agents import checkpoint, ranges, tables
 from endless_gym_agents.experiments.planning import flags
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.ranges import FromZero, Natural, Positive, Range
@@ -374,12 +372,11 @@ class Trials:
             pruned = len(self.study.get_trials(states=(TrialState.PRUNED,)))
             if not done:
                 return
-            table = Table(title=f"{len(done)} trials complete, {pruned} pruned", title_justify="left", box=box.SIMPLE)
-            for name in ("trial", "reward", "changes"):
-                table.add_column(name, justify="left" if name == "changes" else "right")
+            title = f"{len(done)} trials complete, {pruned} pruned"
+            table = tables.table(title, {"trial": True, "reward": True, "changes": False})
             for trial in done[:10]:
                 table.add_row(str(trial.number), f"{trial.value:.4f}", self.changed(trial.params) or "none")
-            self.console.print(table)
+            tables.show(table, self.console)
             best = to_dict(with_choices(self.arguments.settings, done[0].params))
             trials = [
                 {"trial": trial.number, "state": trial.state.name, "reward": trial.value, "choices": trial.params}

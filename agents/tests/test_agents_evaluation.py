@@ -15,7 +15,7 @@ from rich.console import Console
 
 import endless_gym_agents
 from endless_gym.specs import spec
-from endless_gym_agents import checkpoint, protocol
+from endless_gym_agents import checkpoint, protocol, tables
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.evaluate import evaluate
 from endless_gym_agents.metrics import path_length, task_progress
@@ -214,7 +214,7 @@ def test_the_table_says_which_metric_to_trust() -> None:
         run = Run("run", 1)
         run.add(64, episodes)
         console = Console(width=100, record=True, file=io.StringIO())
-        console.print(protocol.table(Experiment(env, "gru", {}, [run])))
+        tables.show(protocol.table(Experiment(env, "gru", {}, [run])), console)
         return " ".join(console.export_text().split())
 
     table = printed(GRID)
