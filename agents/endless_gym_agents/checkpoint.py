@@ -15,6 +15,7 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,17 +214,22 @@ def _read_of_rust(file: Path) -> dict[str, Any]:
     try:
         with safe_open(file, "pt") as content:
             metadata = content.metadata() or {}
-            model = {name: content.get_tensor(name) for name in content.keys() if not name.startswith("state/")}  # noqa: SIM118
+            tensors = {name: content.get_tensor(name) for name in sorted(content.keys())}
     except SafetensorError as error:
         raise ValueError(f"{file} is not a file of safetensors, or is truncated: {error}") from error
     if "endless" not in metadata:
         raise ValueError(f"{file} is not a checkpoint of `endless learn`: it has weights only")
     try:
+        checksum = zlib.crc32(metadata["endless"].encode())
+        for name, tensor in tensors.items():
+            checksum = zlib.crc32(tensor.numpy().tobytes(), zlib.crc32(name.encode(), checksum))
+        if metadata.get("crc32", f"{checksum:08x}") != f"{checksum:08x}":
+            raise ValueError("its checksum differs")
         header = json.loads(metadata["endless"])
         state = {name: header[name] for name in ("version", "settings", "update", "steps")}
     except (KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"checkpoint {file} is damaged: {error}") from error
-    return state | {"model": model}
+    return state | {"model": {name: tensor for name, tensor in tensors.items() if not name.startswith("state/")}}
 
 
 def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Settings]:

@@ -126,11 +126,21 @@ def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monk
 def test_a_damaged_or_forged_checkpoint_is_refused(tmp_path: Path) -> None:
     run = new_run(tmp_path / "run", "--ppo.updates 1")
     file = run / "checkpoints" / "last.safetensors"
-    content = np.fromfile(file, np.uint8)
+    content, draws = np.fromfile(file, np.uint8), np.random.default_rng(3)
     for length in (*range(0, len(content), 997), len(content) - 1):
         content[:length].tofile(file)
         with pytest.raises(ValueError, match="safetensors"):
             checkpoint.load(file)
+    refused = 0
+    for _ in range(100):
+        damaged = content.copy()
+        damaged[draws.integers(len(content))] ^= draws.integers(1, 256, dtype=np.uint8)
+        damaged.tofile(file)
+        try:
+            checkpoint.load(file)
+        except ValueError:
+            refused += 1
+    assert refused > 98
     content.tofile(file)
     weights, whole = load_file(file), checkpoint.load(file).state
     header = {name: whole[name] for name in ("version", "settings", "update", "steps")}

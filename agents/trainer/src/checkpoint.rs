@@ -2,7 +2,7 @@
 //!
 //! The weights have their names and shapes in PyTorch's `state_dict`, so that any reader of the format finds them. The other tensors
 //! begin with `state/`, and the rest is JSON text in the entry `endless` of the metadata. The random numbers need no state: each update
-//! has a generator of its own.
+//! has a generator of its own. A checksum of all of it, in the entry `crc32`, detects damage, which the format does not.
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -15,16 +15,34 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, file};
 use crate::metrics::Episode;
 use crate::rollout::State;
-use crate::settings::Settings;
+use crate::settings::{Agent, Settings};
 use endless_gym_kernels::network::{Network, Tensor};
 
 /// Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed.
 const VERSION: u32 = 1;
-/// The entry of the metadata.
+/// Entries of the metadata: the header, and the checksum.
 const METADATA: &str = "endless";
+const CHECKSUM: &str = "crc32";
 /// Names in the folder of a run: the folder of the checkpoints, and the last checkpoint in it.
 const FOLDER: &str = "checkpoints";
 const LAST: &str = "last.safetensors";
+
+/// Largest numbers of updates and of steps that a header may claim: far more than any run has, and far from an overflow.
+const MAX_UPDATES: i32 = 1 << 30;
+const MAX_STEPS: u64 = 1 << 53;
+
+/// The checksum of a header and of tensors in the order of their names.
+fn checksum<'a>(header: &str, tensors: impl Iterator<Item = (&'a str, &'a [u8])>) -> String {
+    let mut tensors: Vec<_> = tensors.collect();
+    tensors.sort_unstable();
+    let mut sum = crc32fast::Hasher::new();
+    sum.update(header.as_bytes());
+    for (name, bytes) in tensors {
+        sum.update(name.as_bytes());
+        sum.update(bytes);
+    }
+    format!("{:08x}", sum.finalize())
+}
 
 /// What a checkpoint holds besides numbers.
 #[derive(Serialize, Deserialize)]
@@ -82,7 +100,8 @@ pub fn save(
         .map(|(name, dtype, shape, bytes)| Ok((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?)));
     let wrong = |error: safetensors::SafeTensorError| Error::Checkpoint { path: last.clone(), what: error.to_string() };
     let views = views.collect::<Result<Vec<_>, _>>().map_err(wrong)?;
-    let metadata = [(METADATA.to_owned(), header)].into_iter().collect();
+    let sum = checksum(&header, tensors.iter().map(|(name, _, _, bytes)| (&**name, &**bytes)));
+    let metadata = [(METADATA.to_owned(), header), (CHECKSUM.to_owned(), sum)].into_iter().collect();
     let content = safetensors::serialize(views, Some(metadata)).map_err(wrong)?;
 
     let write = || {
@@ -129,8 +148,52 @@ impl Checkpoint {
         Error::Checkpoint { path: self.path.clone(), what: what.into() }
     }
 
-    fn tensors(&self) -> Result<SafeTensors<'_>, Error> {
-        SafeTensors::deserialize(&self.content).map_err(|error| self.wrong(format!("is damaged: {error}")))
+    /// The tensors and the text of the header. Files of weights from other programs have neither header nor checksum.
+    fn tensors(&self) -> Result<(SafeTensors<'_>, Option<String>), Error> {
+        let damaged = |error| self.wrong(format!("is damaged: {error}"));
+        let tensors = SafeTensors::deserialize(&self.content).map_err(damaged)?;
+        let metadata = SafeTensors::read_metadata(&self.content).map_err(damaged)?.1;
+        let entry = |name: &str| metadata.metadata().as_ref().and_then(|entries| entries.get(name)).cloned();
+        let header = entry(METADATA);
+        let sum = checksum(header.as_deref().unwrap_or_default(), tensors.iter().map(|(name, t)| (name, t.data())));
+        if entry(CHECKSUM).is_some_and(|expected| expected != sum) {
+            return Err(self.wrong("is damaged: its checksum differs"));
+        }
+        Ok((tensors, header))
+    }
+
+    /// The header, which only a checkpoint of a run has.
+    fn header(&self, text: Option<String>) -> Result<Header, Error> {
+        let text = text.ok_or_else(|| self.wrong("cannot be resumed, as it has weights only; use --init-from"))?;
+        let header: Header = serde_json::from_str(&text).map_err(Error::json(self.path.display()))?;
+        let Header { version, update, steps, optimizer_updates, .. } = header;
+        if version != VERSION {
+            return Err(self.wrong(format!("must be of version {VERSION}, got {version}")));
+        }
+        if update > MAX_UPDATES as u64 || steps > MAX_STEPS || !(0..=MAX_UPDATES).contains(&optimizer_updates) {
+            let given = format!("{update} updates, {optimizer_updates} of the optimizer, and {steps} steps");
+            return Err(self.wrong(format!("cannot be resumed, as it claims {given}")));
+        }
+        Ok(header)
+    }
+
+    /// Checks that the checkpoint is of a run with these settings and has weights of these sizes, before a network takes memory for them.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Checkpoint`] or [`Error::Json`] if it is damaged, and [`Error::Settings`] if it is of another run.
+    pub fn check(&self, settings: &Settings) -> Result<(), Error> {
+        settings.check_resumable(&self.header(self.tensors()?.1)?.settings)?;
+        let hidden = if settings.agent == Agent::None { 1 } else { settings.recurrence.hidden_size };
+        let model = &settings.model;
+        let body = if model.body_width > 0 { model.body_width } else { hidden };
+        // Fewer than the network has.
+        let others = model.vector_width + (hidden + 2 * model.head_width) * body;
+        let weights = settings.recurrence.layers * 2 * hidden * hidden + others;
+        if size_of::<f32>() * weights > self.content.len() {
+            return Err(self.wrong(format!("has {} bytes, too few for {weights} weights", self.content.len())));
+        }
+        Ok(())
     }
 
     /// The numbers of a tensor, which must have this type and shape.
@@ -181,14 +244,8 @@ impl Checkpoint {
         optimizer: &mut AdamW,
         num_envs: usize,
     ) -> Result<(u64, u64, State), Error> {
-        let tensors = self.tensors()?;
-        let metadata = SafeTensors::read_metadata(&self.content).map_err(|error| self.wrong(error.to_string()))?.1;
-        let text = metadata.metadata().as_ref().and_then(|entries| entries.get(METADATA));
-        let text = text.ok_or_else(|| self.wrong("cannot be resumed, as it has weights only; use --init-from"))?;
-        let header: Header = serde_json::from_str(text).map_err(Error::json(self.path.display()))?;
-        if header.version != VERSION {
-            return Err(self.wrong(format!("must be of version {VERSION}, got {}", header.version)));
-        }
+        let (tensors, text) = self.tensors()?;
+        let header = self.header(text)?;
         self.load_weights(&tensors, network, true)?;
         let count = [network.parameters.len()];
         let mean = self.numbers(&tensors, "state/optimizer/mean", Dtype::F32, &count)?;
@@ -215,7 +272,7 @@ impl Checkpoint {
     ///
     /// [`Error::Checkpoint`] if the memories or the layers after them differ.
     pub fn start(&self, network: &mut Network) -> Result<String, Error> {
-        let missing = self.load_weights(&self.tensors()?, network, false)?;
+        let missing = self.load_weights(&self.tensors()?.0, network, false)?;
         let (all, path) = (network.tensors.len(), self.path.display());
         let others =
             if missing.is_empty() { String::new() } else { format!("; newly initialised: {}", missing.join(", ")) };

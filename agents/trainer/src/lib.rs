@@ -66,8 +66,10 @@ pub fn learn(
     let folder = RunFolder::open(&settings)?;
     let run = &*folder.path;
     let is_resumed = !settings.resume.is_empty();
-    if is_resumed {
+    let resumed = is_resumed.then(|| Checkpoint::read(run)).transpose()?;
+    if let Some(checkpoint) = &resumed {
         settings.check_resumable(&settings::read(run)?)?;
+        checkpoint.check(&settings)?;
     }
     let kept = Settings { resume: String::new(), run: run.to_string_lossy().into_owned(), ..settings.clone() };
     let num_envs = settings.environment.num_envs;
@@ -78,9 +80,9 @@ pub fn learn(
     let mut learner = Learner::new(network.parameters.len());
     let mut player = Player::new(&settings, &network, &threads, environments)?;
     let (mut update, mut steps) = (0, 0);
-    if is_resumed {
+    if let Some(checkpoint) = resumed {
         let state;
-        (update, steps, state) = Checkpoint::read(run)?.resume(&mut network, &mut learner.optimizer, num_envs)?;
+        (update, steps, state) = checkpoint.resume(&mut network, &mut learner.optimizer, num_envs)?;
         player.restore(state)?;
     } else if !settings.init_from.is_empty() {
         print(Checkpoint::read(Path::new(&settings.init_from))?.start(&mut network)?);

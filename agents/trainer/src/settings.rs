@@ -271,7 +271,8 @@ const PAPER: &[(&str, &str)] = &[
 /// Environment steps of one update of the paper.
 const PAPER_STEPS_PER_UPDATE: u64 = 32 * 512;
 
-/// Largest size of a layer. Beyond, a mistyped number would use up the memory of the machine.
+/// Largest number of steps of an update, and largest size of a layer. Beyond, a mistyped number would use up the memory of the machine.
+const MAX_STEPS: usize = 1 << 24;
 const MAX_WIDTH: u64 = 16_384;
 /// Largest number of environments, steps or parts.
 const MAX_COUNT: u64 = u32::MAX as u64;
@@ -402,9 +403,9 @@ impl Settings {
         let error = if num_envs % groups != 0 {
             let rule = "--environment.num-envs must be a multiple of --environment.groups";
             format!("{rule}, got {num_envs} environments and {groups} groups")
-        } else if steps > u32::MAX as usize {
+        } else if steps > MAX_STEPS {
             let given = ppo.steps;
-            format!("an update must have fewer than 2^32 steps, got {num_envs} environments and {given} steps")
+            format!("an update must have at most {MAX_STEPS} steps, got {num_envs} environments and {given} steps")
         } else if ppo.minibatches > steps {
             let given = ppo.minibatches;
             format!("--ppo.minibatches must be 1 to {steps}, the steps of an update, got {given}")
@@ -450,7 +451,11 @@ impl Settings {
     pub fn check_resumable(&self, before: &Settings) -> Result<(), Error> {
         let json = |settings: &Settings| serde_json::to_value(settings).map_err(Error::json(SETTINGS));
         let (given, had) = (json(self)?, json(before)?);
-        for ((group, name, given), (_, _, had)) in flat(&given).into_iter().zip(flat(&had)) {
+        let had = flat(&had);
+        for (group, name, given) in flat(&given) {
+            // A setting without a value is absent.
+            let had = had.iter().find(|(of, other, _)| (*of, *other) == (group, name));
+            let had = had.map(|(_, _, values)| values.clone()).unwrap_or_default();
             let is_kept = match group {
                 "" => ["env", "agent", "preset", "seed"].contains(&name),
                 "environment" => !["engine", "num_threads"].contains(&name),

@@ -18,6 +18,7 @@ use endless_gym_trainer::learn;
 use endless_gym_trainer::network;
 use endless_gym_trainer::settings::{Settings, with_defaults, with_negations};
 use safetensors::SafeTensors;
+use safetensors::tensor::TensorView;
 use serde_json::Value as Json;
 
 /// A short run with small networks, on two layers and sequences shorter than a segment.
@@ -218,6 +219,117 @@ fn errors_say_what_is_allowed_and_leave_nothing() {
         let error = try_run(&format!("--resume {} --ppo.updates 2", run.display())).unwrap_err();
         assert!(matches!(error, Error::Checkpoint { .. }), "{error}");
     }
+}
+
+/// Changes the header and the bytes of the tensors of a checkpoint. Without `keeps_checksum` it has none, as weights of other programs.
+fn forge(file: &Path, header: impl Fn(&mut Json), bytes: impl Fn(&str, &mut Vec<u8>), keeps_checksum: bool) {
+    let content = fs::read(file).unwrap();
+    let (_, metadata) = SafeTensors::read_metadata(&content).unwrap();
+    let mut metadata = metadata.metadata().clone().unwrap();
+    let mut text: Json = serde_json::from_str(&metadata["endless"]).unwrap();
+    header(&mut text);
+    metadata.insert("endless".to_owned(), text.to_string());
+    if !keeps_checksum {
+        metadata.remove("crc32").unwrap();
+    }
+    let mut tensors: Vec<_> = SafeTensors::deserialize(&content).unwrap().tensors();
+    tensors.sort_by(|a, b| a.0.cmp(&b.0));
+    let changed: Vec<_> = tensors
+        .iter()
+        .map(|(name, tensor)| {
+            let mut data = tensor.data().to_vec();
+            bytes(name, &mut data);
+            (name.clone(), tensor.dtype(), tensor.shape().to_vec(), data)
+        })
+        .collect();
+    let views = changed
+        .iter()
+        .map(|(name, dtype, shape, data)| (name.clone(), TensorView::new(*dtype, shape.clone(), data).unwrap()));
+    fs::write(file, safetensors::serialize(views, Some(metadata)).unwrap()).unwrap();
+}
+
+#[test]
+fn a_damaged_or_forged_checkpoint_is_an_error_and_takes_no_memory_for_what_it_claims() {
+    let folder = Folder::new("forged");
+    let run = folder.run("run", "--ppo.updates 1");
+    let file = run.join("checkpoints/last.safetensors");
+    let (content, settings_file) = (fs::read(&file).unwrap(), run.join("settings.json"));
+    let text = fs::read_to_string(&settings_file).unwrap();
+    let resume = || try_run(&format!("--resume {} --ppo.updates 2", run.display()));
+
+    // Any changed byte is found, or changes nothing.
+    let mut random = Generator::from_seed(3);
+    let mut refused = 0;
+    for _ in 0..60 {
+        let mut damaged = content.clone();
+        damaged[random.integers(0, content.len() as i64) as usize] ^= random.integers(1, 256) as u8;
+        fs::write(&file, &damaged).unwrap();
+        refused += usize::from(matches!(resume(), Err(Error::Checkpoint { .. } | Error::Json { .. })));
+        fs::write(&settings_file, &text).unwrap();
+    }
+    assert!(refused >= 59, "{refused} of 60 changes were refused");
+
+    // Numbers that no run has, without a checksum.
+    let same = |_: &str, _: &mut Vec<u8>| {};
+    let claims = [("update", u64::MAX), ("steps", u64::MAX), ("optimizer_updates", i32::MAX as u64), ("version", 9)];
+    for (name, number) in claims {
+        fs::write(&file, &content).unwrap();
+        forge(&file, |header| header[name] = number.into(), same, false);
+        let error = resume().unwrap_err().to_string();
+        assert!(error.contains(&number.to_string()), "{error}");
+    }
+    // The checksum covers the header.
+    fs::write(&file, &content).unwrap();
+    forge(&file, |header| header["steps"] = 1.into(), same, true);
+    assert!(resume().unwrap_err().to_string().contains("its checksum differs"));
+    // State that is not finite, or no state of an environment.
+    for part in
+        ["state/hidden/0", "state/optimizer/mean", "state/optimizer/square", "state/environments", "state/lengths"]
+    {
+        fs::write(&file, &content).unwrap();
+        forge(
+            &file,
+            |_| {},
+            |name, data| {
+                if name == part {
+                    data.fill(255);
+                }
+            },
+            false,
+        );
+        let error = resume().unwrap_err();
+        let is_expected = matches!(error, Error::Diverged { .. } | Error::Checkpoint { .. } | Error::Snapshot(_));
+        assert!(is_expected, "{part}: {error}");
+        fs::write(&settings_file, &text).unwrap();
+    }
+    // Sizes that the weights do not have: hundreds of gigabytes.
+    fs::write(&file, &content).unwrap();
+    let claim = |settings: &mut Json| {
+        settings["recurrence"]["hidden_size"] = 16_384.into();
+        settings["recurrence"]["layers"] = 64.into();
+    };
+    forge(&file, |header| claim(&mut header["settings"]), same, false);
+    let mut claimed: Json = serde_json::from_str(&text).unwrap();
+    claim(&mut claimed);
+    fs::write(&settings_file, claimed.to_string()).unwrap();
+    let error = resume().unwrap_err().to_string();
+    assert!(error.contains("too few for 34"), "{error}");
+    // The checkpoint of another run.
+    let other = folder.run("other", "--ppo.updates 1 --environment.option arena_size=6");
+    fs::write(&settings_file, &text).unwrap();
+    fs::copy(other.join("checkpoints/last.safetensors"), &file).unwrap();
+    let error = resume().unwrap_err().to_string();
+    assert!(error.contains("must keep its environment.option"), "{error}");
+    // Deep nesting is no value of a setting.
+    fs::write(&settings_file, format!("{{\"env\": {}", "[".repeat(100_000))).unwrap();
+    assert!(parse(&format!("--resume {}", run.display())).unwrap_err().contains("is not of this version"));
+}
+
+#[test]
+fn a_resumed_run_may_have_a_new_target() {
+    let folder = Folder::new("target");
+    let run = folder.run("run", "--ppo.updates 1");
+    try_run(&format!("--resume {} --ppo.updates 2 --target-reward 0.5", run.display())).unwrap();
 }
 
 #[test]
