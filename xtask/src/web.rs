@@ -95,8 +95,8 @@ pub fn build() -> Result<(), String> {
     let engine = fs::read(&engine).map_err(describe(&engine))?;
     let files = endless_gym_page::files(&engine, |_| true);
     write(&folder()?, &files)?;
-    // The program embeds the engine from here. It is not rewritten unchanged, to avoid a rebuild.
-    let embedded = workspace().join("engine/view/page/built");
+    let embedded = embedded();
+    // It is not rewritten unchanged, to avoid a rebuild.
     if fs::read(embedded.join("engine.wasm")).ok().as_ref() != Some(&engine) {
         write(&embedded, &[("engine.wasm", engine)])?;
     }
@@ -108,9 +108,17 @@ pub fn build() -> Result<(), String> {
     Ok(())
 }
 
-/// Builds the page and the program, and plays in a browser.
+/// The folder from which the program embeds the engine, `engine.wasm`.
+fn embedded() -> PathBuf {
+    workspace().join("engine/view/page/built")
+}
+
+/// Builds the page and the program, and plays in a browser. Without a compiler for WebAssembly, the program embeds an engine that was
+/// built earlier, or that of a release.
 pub fn play(arguments: &[String]) -> Result<(), String> {
-    build()?;
+    if Toolchain::find().is_some() || !embedded().join("engine.wasm").exists() {
+        build()?;
+    }
     run(cargo(&["run", "--locked", "--release", "--bin", "endless", "--", "play", "--open"]).args(arguments))
 }
 
