@@ -59,7 +59,7 @@ fn not_run(what: &str) -> Result<(), String> {
 /// Compares with the original: with a fixed seed, or `steps` steps of each environment with new seeds, optimised, since
 /// they take long.
 pub fn test_original(steps: Option<u64>) -> Result<(), String> {
-    let mut cargo = shell::cargo(&["test", "--locked", "--test", "integration"]);
+    let mut cargo = shell::cargo(&["test", "--workspace", "--locked", "--test", "integration"]);
     match steps {
         Some(steps) => cargo.arg("--release").env("ENDLESS_LIVE_STEPS", steps.to_string()),
         None => cargo.env("PROPTEST_RNG_SEED", PROPERTY_SEED),

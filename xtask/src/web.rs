@@ -129,8 +129,9 @@ pub fn test() -> Result<(), String> {
     install()?;
     // Skip tests that only measure or make pictures.
     let tests = ["--ignored", "--test-threads", "1", "--skip", "measure"];
-    run(cargo(&["test", "--locked", "--package", "endless-gym-web", "--test", "browser", "--"]).args(tests))?;
-    run(cargo(&["test", "--locked", "--test", "integration", "--"]).args(tests).arg("browser::"))
+    // Of the whole workspace, since packages that are selected alone are compiled again with fewer features.
+    run(cargo(&["test", "--workspace", "--locked", "--test", "browser", "--"]).args(tests))?;
+    run(cargo(&["test", "--workspace", "--locked", "--test", "integration", "--"]).args(tests).arg("browser::"))
 }
 
 /// Installs in target/npm what the tests take from npm, in the versions of their lock file.
