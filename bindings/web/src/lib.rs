@@ -93,8 +93,8 @@ pub extern "C" fn open() -> u32 {
     reply(request::open)
 }
 
-/// Reads the agent in the input, a file that `endless_gym_agents.export` writes. Returns the kind of the output, like
-/// [`call`].
+/// Reads the agent in the input, a checkpoint of `endless learn` or a file that `endless_gym_agents.export` writes. Returns
+/// the kind of the output, like [`call`].
 #[unsafe(no_mangle)]
 pub extern "C" fn load_agent() -> u32 {
     reply(request::load_agent)

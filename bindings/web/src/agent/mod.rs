@@ -1,94 +1,210 @@
-//! Trained agents: the file that `endless_gym_agents.export` writes, and the policy network.
+//! Trained agents that observe features: files of `endless learn` and of `endless_gym_agents.export`, in the format safetensors.
 
-mod file;
-mod network;
 #[cfg(test)]
 mod tests;
 
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::random::{Generator, SeedSequence};
-use serde_json::{Value as Json, json};
+use endless_gym_kernels::categorical;
+use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass, Tensor};
+use endless_gym_kernels::sequences::Sequences;
+use safetensors::{Dtype, SafeTensorError, SafeTensors};
+use serde::Deserialize;
+use serde_json::{Map, Value as Json, json};
+use thiserror::Error;
 
-pub use file::AgentFileError;
-use file::{Header, Tensors};
-use network::Network;
+/// The entry of a file's metadata.
+const METADATA: &str = "endless";
+/// Largest size of a layer, and number of recurrent layers. With these, the number of weights fits into 32 bits.
+const MAX_SIZE: usize = 4096;
+const MAX_LAYERS: usize = 16;
+
+/// A file that is not an agent, or one that cannot act.
+#[derive(Debug, Error)]
+pub enum AgentFileError {
+    #[error("the file must be an exported agent in the format safetensors: {0}")]
+    Format(#[from] SafeTensorError),
+    #[error("the file of an agent must have the entry `{METADATA}` of its metadata; export the agent again")]
+    Metadata,
+    #[error("the header of an agent cannot be read: {0}")]
+    Header(#[from] serde_json::Error),
+    #[error("an agent on the page must be gru, mingru or none, got {given}")]
+    Kind { given: String },
+    #[error("the agent must have a float32 tensor `{name}` of shape {expected}, got {given}")]
+    Tensor { name: String, expected: String, given: String },
+    #[error("the weights of an agent must be finite, got {given} in `{name}`")]
+    NotFinite { name: String, given: f32 },
+}
+
+/// The metadata of a file.
+#[derive(Debug, Deserialize)]
+struct Header {
+    update: u64,
+    steps: u64,
+    /// Only of exported agents.
+    #[serde(default)]
+    evaluation: Vec<Json>,
+    settings: Settings,
+}
+
+#[derive(Debug, Deserialize)]
+struct Settings {
+    env: String,
+    agent: String,
+    environment: Environment,
+    recurrence: Recurrence,
+}
+
+#[derive(Debug, Deserialize)]
+struct Environment {
+    option: Vec<String>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Recurrence {
+    residual: bool,
+}
 
 /// A trained agent.
-#[derive(Debug)]
 pub struct Agent {
     header: Header,
     network: Network,
 }
 
+/// An agent's state within an episode.
+pub struct Memory {
+    pass: Pass,
+    random: Generator,
+}
+
 impl Agent {
     /// Reads the file of an agent.
     pub fn read(file: &[u8]) -> Result<Self, AgentFileError> {
-        let (header, mut tensors) = Tensors::read(file)?;
-        let network = Network::new(&header.branches, &mut tensors)?;
+        let tensors = SafeTensors::deserialize(file)?;
+        let metadata = SafeTensors::read_metadata(file)?.1;
+        let text = metadata.metadata().as_ref().and_then(|entries| entries.get(METADATA));
+        let header: Header = serde_json::from_str(text.ok_or(AgentFileError::Metadata)?)?;
+        let spec = network_spec(&header.settings, &tensors)?;
+        let network = Network::new(spec, |tensor| weights(&tensors, tensor))?;
         Ok(Agent { header, network })
     }
 
     /// The id of the environment that it was trained in.
     pub fn env(&self) -> &str {
-        &self.header.env
+        // The Python agents write Gymnasium's id, with a namespace.
+        self.header.settings.env.rsplit('/').next().unwrap_or_default()
     }
 
     /// Whether its features and actions are those of that environment.
     pub fn fits(&self, spec: &EnvSpec) -> bool {
-        self.header.env == spec.id
-            && self.network.features() == spec.features.len()
-            && spec.action_space.branches().iter().map(|choices| *choices as usize).eq(self
-                .header
-                .branches
-                .iter()
-                .copied())
+        let choices = spec.action_space.branches().iter().map(|choices| *choices as usize);
+        self.env() == spec.id
+            && self.network.spec.observation_width == spec.features.len()
+            && choices.eq(self.network.spec.choices.iter().copied())
     }
 
     /// The memory at the start of an episode with that seed. Actions are sampled from a different random stream than
     /// the environment's.
     pub fn memory(&self, seed: u64) -> Memory {
         let stream = SeedSequence::new(seed).with_spawn_key(&[1]);
-        Memory { hidden: vec![0.0; self.network.hidden()], random: Generator::from_seed_sequence(&stream) }
+        let (spec, mut pass) = (&self.network.spec, Pass::default());
+        pass.states = vec![vec![0.0; spec.hidden_size]; spec.layers];
+        Memory { pass, random: Generator::from_seed_sequence(&stream) }
     }
 
     /// Samples an action for the features of a step, and updates the memory.
     pub fn act(&self, features: &[f32], memory: &mut Memory, action: &mut [i32]) {
-        let logits = self.network.step(features, &mut memory.hidden);
-        let mut first = 0;
-        for (number, choices) in action.iter_mut().zip(&self.header.branches) {
-            *number = sample(&logits[first..first + choices], &mut memory.random) as i32;
-            first += choices;
+        self.step(features, &mut memory.pass);
+        let choices = &self.network.spec.choices;
+        let noise: Vec<f32> =
+            memory.pass.logits.iter().map(|_| categorical::gumbel(memory.random.random_f32())).collect();
+        let mut chosen = vec![0; choices.len()];
+        categorical::sample(&memory.pass.logits, choices, Some(&noise), &mut chosen);
+        action.iter_mut().zip(chosen).for_each(|(action, chosen)| *action = chosen as i32);
+    }
+
+    /// Computes the logits of all branches, and the hidden states after the step.
+    fn step(&self, features: &[f32], pass: &mut Pass) {
+        pass.observations.clear();
+        pass.observations.extend_from_slice(features);
+        self.network.forward(Sequences::new(&[1], &[]).expect("one step"), pass);
+        for layer in 0..pass.states.len() {
+            let after = pass.hidden(layer).to_vec();
+            pass.states[layer] = after;
         }
     }
 
     /// The agent's description for the page.
     pub fn description(&self) -> Json {
+        let Header { update, steps, evaluation, settings } = &self.header;
+        let option = |given: &String| {
+            let (name, value) = given.split_once('=')?;
+            Some((name.to_owned(), serde_json::from_str(value).unwrap_or_else(|_| Json::from(value))))
+        };
+        let options: Map<String, Json> = settings.environment.option.iter().filter_map(option).collect();
+        let (env, agent) = (self.env(), &settings.agent);
         json!({
-            "env": self.header.env,
-            "options": self.header.options,
-            "updates": self.header.updates,
-            "steps": self.header.steps,
-            "evaluation": self.header.evaluation,
+            "env": env,
+            "agent": agent,
+            "options": options,
+            "updates": update,
+            "steps": steps,
+            "evaluation": evaluation,
         })
     }
 }
 
-/// An agent's state within an episode.
-pub struct Memory {
-    hidden: Vec<f32>,
-    random: Generator,
+/// Kinds and sizes of the layers, from the shapes of a file's tensors.
+fn network_spec(settings: &Settings, tensors: &SafeTensors) -> Result<NetworkSpec, AgentFileError> {
+    let has = |name: &str| tensors.tensor(name).is_ok();
+    let size = |name: &str, axis: usize| {
+        let given = tensors.tensor(name).map(|tensor| tensor.shape().to_vec()).ok();
+        let size = given.as_ref().and_then(|shape| shape.get(axis).copied());
+        size.filter(|size| (1..=MAX_SIZE).contains(size)).ok_or_else(|| AgentFileError::Tensor {
+            name: name.to_owned(),
+            expected: format!("1 to {MAX_SIZE} on axis {axis}"),
+            given: given.map_or_else(|| "none".to_owned(), |shape| format!("{shape:?}")),
+        })
+    };
+    let gru = |layer: usize| format!("memory.recurrent.bias_hh_l{layer}");
+    let mingru = |layer: usize| format!("memory.cell.layers.{layer}.projection.bias");
+    let count = |name: &dyn Fn(usize) -> String| (0..MAX_LAYERS).take_while(|layer| has(&name(*layer))).count();
+    let (memory, layers, hidden_size) = match &*settings.agent {
+        "gru" => (Layers::Gru, count(&gru), size("memory.recurrent.weight_hh_l0", 1)?),
+        "mingru" => (Layers::MinGru, count(&mingru), size(&mingru(0), 0)? / 2),
+        "none" => (Layers::Gru, 0, 1),
+        given => return Err(AgentFileError::Kind { given: given.to_owned() }),
+    };
+    let branch = |branch: usize| format!("policy.branches.{branch}.weight");
+    let choices = (0..MAX_LAYERS).map(branch).take_while(|name| has(name)).map(|name| size(&name, 0));
+    Ok(NetworkSpec {
+        observation_width: size("encoder.vector.0.weight", 1)?,
+        encoder_width: size("encoder.vector.0.weight", 0)?,
+        embedding: has("memory.embedding.0.weight"),
+        memory,
+        layers,
+        hidden_size,
+        residual: layers > 0 && settings.recurrence.residual,
+        body_width: size("body.0.weight", 0)?,
+        head_width: size("policy.hidden.0.weight", 0)?,
+        choices: choices.collect::<Result<_, _>>()?,
+    })
 }
 
-/// Samples from the softmax with the Gumbel-max trick, as in training.
-fn sample(logits: &[f32], random: &mut Generator) -> usize {
-    let mut best = (0, f64::NEG_INFINITY);
-    for (choice, logit) in logits.iter().enumerate() {
-        // `1 - random` is in (0, 1], so the first logarithm is finite.
-        let noise = -(-(1.0 - random.random()).ln()).ln();
-        let value = f64::from(*logit) + noise;
-        if value > best.1 {
-            best = (choice, value);
-        }
+/// The weights of a tensor.
+fn weights(tensors: &SafeTensors, tensor: &Tensor) -> Result<Vec<f32>, AgentFileError> {
+    let (name, found) = (&tensor.name, tensors.tensor(&tensor.name).ok());
+    let Some(view) = found.as_ref().filter(|view| view.dtype() == Dtype::F32 && view.shape() == tensor.shape) else {
+        return Err(AgentFileError::Tensor {
+            name: name.clone(),
+            expected: format!("{:?}", tensor.shape),
+            given: found.map_or_else(|| "none".to_owned(), |view| format!("{:?} {:?}", view.dtype(), view.shape())),
+        });
+    };
+    let (numbers, _) = view.data().as_chunks();
+    let weights: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+    match weights.iter().find(|weight| !weight.is_finite()) {
+        Some(given) => Err(AgentFileError::NotFinite { name: name.clone(), given: *given }),
+        None => Ok(weights),
     }
-    best.0
 }

@@ -1,7 +1,7 @@
 // The trained agents, and their results on the page.
 
 /** The file of each environment's agent; docs/train/agents.md describes how to make one. */
-const FILES = { "MortarMayhem-Grid-v0": "MortarMayhem-Grid-v0.agent.bin" };
+const FILES = { "MortarMayhem-Grid-v0": "MortarMayhem-Grid-v0.safetensors" };
 
 export class Agents {
   #loaded = new Map();
@@ -53,10 +53,12 @@ export class Agents {
 
   /** One sentence about the training. */
   trained(id) {
-    const { steps, evaluation } = this.description(id);
+    const { agent, steps, evaluation } = this.description(id);
     const share = ({ options, success }) =>
       `${Math.round(100 * success)} %` + Object.entries(options).map(([name, value]) => ` with ${name.replace("_", " ")} ${value}`).join("");
-    return `A GRU, trained for ${(steps / 1e6).toFixed(1)} million steps; it succeeds in ${evaluation.map(share).join(", ")}.`;
+    const kind = { gru: "A GRU", mingru: "A minGRU", none: "An agent without memory" }[agent];
+    const measured = evaluation.length ? `; it succeeds in ${evaluation.map(share).join(", ")}` : "";
+    return `${kind}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
   }
 }
 

@@ -16,7 +16,7 @@ const ENGINE: &str = "engine.wasm";
 const WORKER: &str = "worker.js";
 
 /// The end of the name of a trained agent's file, after the id of its environment.
-const AGENT: &str = ".agent.bin";
+const AGENT: &str = ".safetensors";
 
 /// The file of that name, such as `index.html`, compressed with gzip.
 ///
