@@ -13,8 +13,8 @@ from safetensors import safe_open
 from endless_gym_agents import checkpoint, export
 
 ID = "MortarMayhem-Grid-v0"
-WEB = Path(__file__).resolve().parents[2] / "bindings" / "web"
-FILE = WEB.parents[1] / "engine" / "view" / "page" / "files" / f"{ID}.safetensors"
+ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted((ROOT / "engine" / "view" / "page" / "files").glob("*.safetensors"))
 
 
 def trained(tmp_path: Path, **changes: Any) -> Path:
@@ -23,17 +23,18 @@ def trained(tmp_path: Path, **changes: Any) -> Path:
     return tmp_path
 
 
-def test_the_committed_file_computes_the_committed_vectors() -> None:
-    committed = json.loads((WEB / "tests" / "agents" / f"{ID}.json").read_text())
-    loaded = checkpoint.load(FILE)
-    assert committed["env"] == ID
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_the_committed_file_computes_the_committed_vectors(file: Path) -> None:
+    committed = json.loads((ROOT / "bindings" / "web" / "tests" / "agents" / f"{file.stem}.json").read_text())
+    loaded = checkpoint.load(file)
+    assert committed["env"] == file.stem
     recorded = export.record_vectors(loaded.agent, len(committed["features"]))
     for exact in ("reset", "features", "action"):
         assert recorded[exact] == committed[exact]
     np.testing.assert_allclose(recorded["logits"], committed["logits"], rtol=1e-5, atol=1e-5)
-    assert sum(recorded["reset"]) >= 3
+    assert sum(recorded["reset"]) >= 2
     # Visitors of the page should see it succeed.
-    assert header(FILE)["evaluation"][0]["success"] > 0.9
+    assert header(file)["evaluation"][0]["success"] > 0.9
 
 
 def header(file: Path) -> dict[str, Any]:

@@ -30,9 +30,16 @@ fn largest_difference(found: &[f32], expected: &[f32]) -> f32 {
 }
 
 #[test]
-fn the_network_computes_what_pytorch_computes() {
-    let agent = Agent::read(AGENT).unwrap();
-    let vectors: Vectors = serde_json::from_str(include_str!("../../tests/agents/MortarMayhem-Grid-v0.json")).unwrap();
+fn the_networks_compute_what_pytorch_computes() {
+    for id in ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0"] {
+        let file = std::fs::read(format!("../../engine/view/page/files/{id}.safetensors")).unwrap();
+        assert!(file.len() <= 100_000, "{id}: {} bytes", file.len());
+        let vectors = std::fs::read_to_string(format!("tests/agents/{id}.json")).unwrap();
+        computes(&Agent::read(&file).unwrap(), &serde_json::from_str(&vectors).unwrap());
+    }
+}
+
+fn computes(agent: &Agent, vectors: &Vectors) {
     assert_eq!(agent.env(), vectors.env);
     let mut pass = agent.memory(0).pass;
     let mut episodes = 0;
@@ -44,7 +51,7 @@ fn the_network_computes_what_pytorch_computes() {
         agent.step(features, &mut pass);
         assert!(largest_difference(&pass.logits, expected) <= 1e-5, "{:?} {expected:?}", pass.logits);
     }
-    assert!(episodes >= 3 && vectors.features.len() >= 90, "{episodes} episodes");
+    assert!(episodes >= 2 && vectors.features.len() >= 90, "{episodes} episodes");
     // Without the hidden state, the logits differ.
     let last = vectors.features.len() - 1;
     let mut forgotten = agent.memory(0).pass;
@@ -138,7 +145,7 @@ fn a_broken_file_is_refused() {
     let kind = replaced(r#"\"agent\":\"gru\""#, r#"\"agent\":\"abc\""#);
     assert_eq!(kind.to_string(), "an agent on the page must be gru, mingru or none, got abc");
     let bias = replaced("\"memory.embedding.0.bias\"", "\"memory.embedding.9.bias\"");
-    let text = "the agent must have a float32 tensor `memory.embedding.0.bias` of shape [64], got none";
+    let text = "the agent must have a float32 tensor `memory.embedding.0.bias` of shape [48], got none";
     assert_eq!(bias.to_string(), text);
     assert!(matches!(replaced("\"shape\":[32,17]", "\"shape\":[17,32]"), AgentFileError::Tensor { .. }));
 }

@@ -1,7 +1,7 @@
 // The trained agents, and their results on the page.
 
-/** The file of each environment's agent; docs/train/agents.md describes how to make one. */
-const FILES = { "MortarMayhem-Grid-v0": "MortarMayhem-Grid-v0.safetensors" };
+/** The environments with a trained agent, in the file ID.safetensors; docs/train/agents.md describes how to make one. */
+const IDS = ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0"];
 
 export class Agents {
   #loaded = new Map();
@@ -12,12 +12,12 @@ export class Agents {
   }
 
   has(id) {
-    return id in FILES;
+    return IDS.includes(id);
   }
 
   /** Why there is no agent, or an empty string. */
   reason(id) {
-    return this.has(id) ? "" : `No agent was trained in ${id}; there is one for ${Object.keys(FILES).join(", ")}.`;
+    return this.has(id) ? "" : `No agent was trained in ${id}; there is one for ${IDS.join(", ")}.`;
   }
 
   /** The description in a loaded agent's file. */
@@ -29,7 +29,7 @@ export class Agents {
   async load(id) {
     if (!this.has(id)) throw new Error(this.reason(id));
     if (this.#loaded.has(id)) return this.#loaded.get(id);
-    const url = new URL(FILES[id], import.meta.url);
+    const url = new URL(`${id}.safetensors`, import.meta.url);
     const response = await fetch(url);
     if (!response.ok) throw new Error(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
     this.#loaded.set(id, this.engine.loadAgent(new Uint8Array(await response.arrayBuffer())));
@@ -54,8 +54,10 @@ export class Agents {
   /** One sentence about the training. */
   trained(id) {
     const { agent, steps, evaluation } = this.description(id);
-    const share = ({ options, success }) =>
-      `${Math.round(100 * success)} %` + Object.entries(options).map(([name, value]) => ` with ${name.replace("_", " ")} ${value}`).join("");
+    const share = ({ options, success }) => {
+      const given = Object.entries(options).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`);
+      return `${Math.round(100 * success)} %` + (given.length ? ` with ${given.join(" and ")}` : "");
+    };
     const kind = { gru: "A GRU", mingru: "A minGRU", none: "An agent without memory" }[agent];
     const measured = evaluation.length ? `; it succeeds in ${evaluation.map(share).join(", ")}` : "";
     return `${kind}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
