@@ -2,6 +2,8 @@
 
 use std::io::{IsTerminal, stdin, stdout};
 use std::mem::ManuallyDrop;
+use std::process::exit;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use ratatui::crossterm::cursor::Show;
@@ -16,6 +18,9 @@ use rustix::time::Timespec;
 
 use super::super::failure::Failure;
 use super::super::stop;
+
+/// Time in which a command ends by itself after its terminal has gone away.
+const GRACE: Duration = Duration::from_secs(2);
 
 /// The alternate screen, in raw mode. Dropping it leaves both, and so do a panic and a second signal.
 ///
@@ -38,6 +43,7 @@ impl Screen {
         // Pictures consist of colours, so NO_COLOR has no meaning here.
         force_color_output(true);
         stop::before_exit(leave);
+        thread::Builder::new().name("terminal".to_owned()).spawn(end_without_terminal)?;
         let entered = ratatui::try_init().map(|terminal| Screen(ManuallyDrop::new(terminal)));
         let screen = entered.map_err(|error| {
             leave();
@@ -61,7 +67,7 @@ impl Screen {
     pub fn event(&self, timeout: Duration) -> Result<Option<Event>, Failure> {
         let until = Instant::now() + timeout;
         let read = || loop {
-            // Reading from a terminal that has gone away, `crossterm` would not return.
+            // Reading from a terminal that has gone away, `crossterm` does not return.
             if self.is_gone() {
                 return Ok(None);
             }
@@ -91,10 +97,21 @@ impl Drop for Screen {
 
 /// Waits until the terminal has input or goes away, and returns what happened. A signal ends the wait.
 fn wait(timeout: Duration) -> PollFlags {
-    let input = stdin();
-    let mut watched = [PollFd::new(&input, PollFlags::IN)];
     let timeout = Timespec::try_from(timeout).unwrap_or_default();
-    poll(&mut watched, Some(&timeout)).map_or(PollFlags::empty(), |_| watched[0].revents())
+    poll_input(PollFlags::IN, Some(&timeout))
+}
+
+fn poll_input(events: PollFlags, timeout: Option<&Timespec>) -> PollFlags {
+    let input = stdin();
+    let mut watched = [PollFd::new(&input, events)];
+    poll(&mut watched, timeout).map_or(PollFlags::empty(), |_| watched[0].revents())
+}
+
+/// Ends the process if the terminal goes away just before `crossterm` reads from it, which then reads forever.
+fn end_without_terminal() {
+    while poll_input(PollFlags::empty(), None).is_empty() {}
+    thread::sleep(GRACE);
+    exit(0);
 }
 
 /// Undoes [`Screen::enter`]. Errors mean that the terminal no longer exists.
