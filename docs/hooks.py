@@ -37,7 +37,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages from elsewhere in the repository, with their pictures."""
     for page, source in PAGES.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text()))
-        for picture in (ROOT / source).parent.glob("*.png"):
+        for picture in (ROOT / source).parent.glob("*.svg"):
             files.append(File.generated(config, f"{Path(page).parent}/{picture.name}", abs_src_path=str(picture)))
     files.append(File.generated(config, "palette.css", content=palette()))
     return files
@@ -92,7 +92,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             raise PluginError(f"{page.file.src_uri}: the link {target} leads nowhere")
         if (ROOT / "docs") in file.parents:
             return f"[{text}]({os.path.relpath(file, ROOT / 'docs' / here)}{anchor or ''})"
-        return found[0] if file.suffix == ".png" else text
+        return text
 
     def contents(found: re.Match[str]) -> str:
         return f"```{Path(found[1]).suffix[1:]}\n{(ROOT / found[1]).read_text()}```"

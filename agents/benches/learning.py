@@ -1,12 +1,13 @@
 """Trains agents with and without memory on small tasks, and evaluates them on seeds that training never uses.
 
     python learning.py --task one-command --agents gru trxl none --seeds 1 2 3
-    python learning.py --plot
+    python learning.py --report
+    cargo xtask pictures
 
 Each run is one `endless-train` with the preset `quick` and the flags below. It stops at the target reward or the time limit
 of the task; an agent without memory gets as many updates as the slowest run with memory. The evaluation plays 50 seeds from
 200,000 on, three episodes each. The results of a task are stored in `learning/TASK.json`, with the commands and the learning
-curves; `--plot` plots all results and writes `learning/README.md`.
+curves; `--report` writes `learning/README.md`, whose plots `cargo xtask pictures` makes.
 """
 
 import argparse
@@ -67,42 +68,6 @@ def as_json(data: dict) -> str:
     return f'{{"task": {task}, "best_reward": {best}, "runs": [\n{runs}\n]}}\n'
 
 
-def plot() -> None:
-    """Plot the learning curves of each task next to its evaluations."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    colours = {"gru": "tab:green", "trxl": "tab:blue", "lstm": "tab:olive", "none": "tab:red", "stack": "tab:orange"}
-    for file in sorted(FOLDER.glob("*.json")):
-        data = json.loads(file.read_text())
-        figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.6), width_ratios=[3, 1], sharey=True)
-        agents = sorted({row["agent"] for row in data["runs"]})
-        for place, agent in enumerate(agents):
-            rows = [row for row in data["runs"] if row["agent"] == agent]
-            for number, row in enumerate(rows):
-                steps, rewards = zip(*row["curve"], strict=True)
-                label = agent if number == 0 else None
-                left.plot(
-                    [step / 1000 for step in steps], rewards, color=colours.get(agent, "grey"), lw=1.2, label=label
-                )
-            heights = [row["evaluation_reward"] for row in rows]
-            right.scatter([place] * len(rows), heights, color=colours.get(agent, "grey"), zorder=3)
-        left.set(xlabel="thousand steps", ylabel="mean reward of 100 episodes", title=f"{data['task']}: training")
-        right.set(
-            title="50 unseen seeds", xticks=range(len(agents)), xticklabels=agents, xlim=(-0.5, len(agents) - 0.5)
-        )
-        for axes in (left, right):
-            axes.grid(alpha=0.3)
-            if data["best_reward"]:
-                axes.axhline(data["best_reward"], color="black", lw=0.8, ls="--")
-        left.legend()
-        figure.tight_layout()
-        figure.savefig(file.with_suffix(".png"), dpi=110)
-        pyplot.close(figure)
-
-
 def report() -> None:
     """Write `learning/README.md` with a table of all runs and the plots."""
     lines = [
@@ -112,16 +77,15 @@ def report() -> None:
         "Each run is one command, on one or two cores of a shared machine. The reward is the mean over 50 seeds that",
         "training never uses, three episodes each. An agent without memory was trained for as many updates as the",
         "slowest earlier run with memory. The JSON files in this folder contain the exact numbers, the learning",
-        "curves and the commands; `learning.py --plot` writes this page from them.",
+        "curves and the commands; `learning.py --report` writes this page from them.",
         "",
         "| task | agent | seeds | steps | minutes | evaluation reward | at most |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    commands, pictures = [], []
+    commands = []
     for task in (task for task in TASKS if (FOLDER / f"{task}.json").exists()):
         data = json.loads((FOLDER / f"{task}.json").read_text())
         commands.append(f"    {data['runs'][0]['command']}")
-        pictures.append(f"![curves of {task}]({task}.png)")
         for agent in sorted({row["agent"] for row in data["runs"]}, key=lambda agent: (agent == "none", agent)):
             rows = sorted((row for row in data["runs"] if row["agent"] == agent), key=lambda row: row["seed"])
             seeds = ", ".join(str(row["seed"]) for row in rows)
@@ -131,12 +95,15 @@ def report() -> None:
             lines.append(
                 f"| {task} | {agent} | {seeds} | {steps} | {minutes} | {rewards} | {data['best_reward'] or ''} |"
             )
-    lines += ["", "The first run of each task:", "", *commands, "", *pictures]
+    picture = '<source media="(prefers-color-scheme: dark)" srcset="curves-dark.svg">'
+    text = "mean reward of the last 100 episodes during training, for each task and agent"
+    picture = f'<picture>{picture}<img src="curves-light.svg" alt="{text}"></picture>'
+    lines += ["", picture, "", "The first run of each task:", "", *commands]
     (FOLDER / "README.md").write_text("\n".join(lines) + "\n")
 
 
 def main() -> None:
-    """Train, evaluate and plot."""
+    """Train, evaluate and report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=TASKS, help="task to train and evaluate")
     parser.add_argument("--agents", nargs="+", default=["gru", "none"], help="agents to train (default: %(default)s)")
@@ -144,7 +111,7 @@ def main() -> None:
         "--seeds", nargs="+", type=int, default=[1, 2, 3], help="seeds of the runs (default: %(default)s)"
     )
     parser.add_argument("--threads", type=int, default=1, help="CPU threads of PyTorch (default: %(default)s)")
-    parser.add_argument("--plot", action="store_true", help="plot all results and write learning/README.md")
+    parser.add_argument("--report", action="store_true", help="write learning/README.md")
     args = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     if args.task:
@@ -169,8 +136,7 @@ def main() -> None:
                     f"{args.task} {agent} {seed}: {row['evaluation_reward']:.4f} after {row['minutes']} minutes",
                     flush=True,
                 )
-    if args.plot:
-        plot()
+    if args.report:
         report()
 
 

@@ -36,6 +36,7 @@ from endless_gym_agents.curves import (
     published_labels,
     training,
 )
+from endless_gym_agents.palette import AGENTS
 from endless_gym_agents.ranges import Natural
 from endless_gym_agents.results import read
 
@@ -115,7 +116,7 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for number, curve in enumerate(curves):
-        rows = estimates(curve, spread)
+        rows, colour = estimates(curve, spread), AGENTS.get(curve.label, (f"C{number}",))[0]
         steps = [row[0] / scale.unit for row in rows]
         style = "--" if curve.source == "published" else "-"
         title = f"{curve.label} (paper)" if curve.source == "published" else curve.label
@@ -123,14 +124,10 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
         if spread == "runs":
             for run in range(len(curve.scores)):
                 values = [row[1 + run] for row in rows]
-                axes.plot(
-                    steps, values, style, marker=marker, color=f"C{number}", alpha=0.8, label=title if not run else ""
-                )
+                axes.plot(steps, values, style, marker=marker, color=colour, alpha=0.8, label=title if not run else "")
         else:
-            axes.plot(steps, [row[1] for row in rows], style, marker=marker, color=f"C{number}", label=title)
-            axes.fill_between(
-                steps, [row[2] for row in rows], [row[3] for row in rows], color=f"C{number}", alpha=0.2, lw=0
-            )
+            axes.plot(steps, [row[1] for row in rows], style, marker=marker, color=colour, label=title)
+            axes.fill_between(steps, [row[2] for row in rows], [row[3] for row in rows], color=colour, alpha=0.2, lw=0)
     axes.set(title=name, xlabel=scale.label, ylabel=axis)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

@@ -16,6 +16,7 @@ from endless_gym.specs import spec
 from endless_gym_agents import enjoy, plot, video
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.curves import aggregate, evaluated, published, scale
+from endless_gym_agents.palette import AGENTS
 from endless_gym_agents.plot import PlotArguments, draw_all
 from endless_gym_agents.results import Experiment, Run, to_json
 from endless_gym_agents.train import train
@@ -143,7 +144,8 @@ def test_plots_contain_the_given_curves(tmp_path: Path) -> None:
     with Image.open(picture) as image:
         assert image.size == (1350, 750)
         colours = {colour for _, colour in image.convert("RGB").getcolors(1 << 20)}
-        assert {(0x1F, 0x77, 0xB4), (0xFF, 0x7F, 0x0E)} <= colours  # both curves
+        both = {tuple(bytes.fromhex(AGENTS[agent][0][1:])) for agent in ("gru", "trxl")}
+        assert both <= colours
     rows = list(csv.DictReader(picture.with_suffix(".csv").open()))
     ours = [row for row in rows if row["source"] == "evaluated"]
     assert [int(row["steps"]) for row in ours] == [10, 20, 30]

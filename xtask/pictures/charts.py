@@ -15,24 +15,30 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 from matplotlib.transforms import blended_transform_factory
 
+from endless_gym_agents.palette import AGENTS as AGENT_COLOURS
+
 matplotlib.use("svg")
 
 
 class Theme(NamedTuple):
-    """Colours of a chart, based on the environments' and adapted to a light or dark page."""
+    """Colours of a chart on a light or dark page."""
 
     text: str
     faint: str
     grid: str
     blue: str
     grey: str
-    green: str
-    red: str
+    agents: dict[str, str]
+
+
+def agents(page: int) -> dict[str, str]:
+    """The colour of each agent on a light (0) or dark (1) page."""
+    return {name: colours[page] for name, colours in AGENT_COLOURS.items()}
 
 
 THEMES = {
-    "light": Theme("#1f2733", "#66707f", "#dfe3e8", "#2d5ea8", "#7b8696", "#308d46", "#b3263a"),
-    "dark": Theme("#d6dce8", "#8d97a6", "#2b323d", "#6ea4f2", "#8b96a5", "#5cc27a", "#f0707e"),
+    "light": Theme("#1f2733", "#66707f", "#dfe3e8", "#2d5ea8", "#7b8696", agents(0)),
+    "dark": Theme("#d6dce8", "#8d97a6", "#2b323d", "#6ea4f2", "#8b96a5", agents(1)),
 }
 
 #: Width of a chart in inches at 96 pixels each, and its font sizes in points.
@@ -62,6 +68,8 @@ GROUPS = {
 AGENTS = {"gru": "GRU", "trxl": "Transformer-XL", "none": "without memory"}
 #: Window of the moving average, in updates.
 SMOOTH = 24
+#: Points of a curve in the chart of all tasks.
+POINTS = 120
 
 
 def chart(folder: Path, name: str, height: float, draw: Callable[[Figure, Theme], None]) -> None:
@@ -179,7 +187,6 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 def learning(folder: Path, results: Path) -> None:
     """Learning curves of agents with and without memory, from a file of `agents/benches/learning.py`."""
     data = json.loads(results.read_text())
-    colours = {"gru": "blue", "trxl": "green", "none": "red"}
 
     def draw(figure: Figure, theme: Theme) -> None:
         axes = figure.add_axes((0.062, 0.14, 0.77, 0.66))
@@ -190,7 +197,7 @@ def learning(folder: Path, results: Path) -> None:
         axes.tick_params(axis="y", colors=theme.faint)
         axes.grid(axis="y", lw=1)
         for agent, name in AGENTS.items():
-            colour, ends = getattr(theme, colours[agent]), []
+            colour, ends = theme.agents[agent], []
             for run in (run for run in data["runs"] if run["agent"] == agent):
                 steps, rewards = np.array(run["curve"]).T
                 share = smooth(rewards / data["best_reward"], SMOOTH)
@@ -204,3 +211,40 @@ def learning(folder: Path, results: Path) -> None:
         header(figure, theme, "With and without memory", note)
 
     chart(folder, "learning", 3.1, draw)
+
+
+def tasks(folder: Path) -> None:
+    """Learning curves of all tasks of `agents/benches/learning.py`, from the files in its folder and into it."""
+    found = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
+    columns = 2
+    rows = -(-len(found) // columns)
+
+    def draw(figure: Figure, theme: Theme) -> None:
+        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for axes in panels[len(found) :]:
+            axes.set_axis_off()
+        for axes, data in zip(panels, found, strict=False):
+            plain(axes)
+            axes.set_title(data["task"], loc="left", fontsize=BODY)
+            axes.tick_params(colors=theme.faint)
+            axes.grid(axis="y", lw=1)
+            if data["best_reward"]:
+                axes.axhline(data["best_reward"], color=theme.faint, lw=0.8, ls="--")
+            for run in data["runs"]:
+                steps, rewards = np.array(run["curve"]).T
+                shown = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
+                window = max(1, len(steps) // POINTS)
+                axes.plot(steps[shown] / 1e6, smooth(rewards, window)[shown], color=theme.agents[run["agent"]], lw=1.2)
+            axes.set_ylim(bottom=0)
+        for place, (agent, name) in enumerate(AGENTS.items()):
+            style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
+            figure.text(0.985 - (0, 0.06, 0.19)[place], 1 - 0.2 / figure.get_figheight(), name, **style)
+        figure.subplots_adjust(0.06, 0.04, 0.985, 0.91, wspace=0.13, hspace=0.42)
+        header(
+            figure,
+            theme,
+            "Learning",
+            "Mean reward of 100 episodes by million environment steps; dashed: the best possible.",
+        )
+
+    chart(folder, "curves", 1.9 * rows + 0.6, draw)

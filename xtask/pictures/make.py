@@ -1,4 +1,5 @@
-"""Makes the pictures of the documentation in `docs/images`: `cargo xtask pictures` installs the package and runs this script.
+"""Makes the pictures of the documentation in `docs/images`, and those of the learning curves: `cargo xtask pictures` installs the
+packages and runs this script.
 
 The animations are episodes of the scripted experts with fixed seeds. The charts show `benches/comparison.md` and the
 results of `agents/benches/learning.py`; measure or train again to change them. The same versions produce the same
@@ -12,13 +13,15 @@ import films
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs/images"
+LEARNING = ROOT / "agents/benches/learning"
 
 
 def main() -> None:
     """Make all pictures."""
     (IMAGES / "environments").mkdir(parents=True, exist_ok=True)
     charts.comparison(IMAGES, ROOT / "benches/comparison.md")
-    charts.learning(IMAGES, ROOT / "agents/benches/learning/three-commands.json")
+    charts.learning(IMAGES, LEARNING / "three-commands.json")
+    charts.tasks(LEARNING)
     films.overview(IMAGES / "environments.webp")
     for scene in films.SCENES:
         films.environment(IMAGES / "environments" / f"{scene.id}.webp", scene)

@@ -243,9 +243,9 @@ pub fn bench(arguments: &[String]) -> Result<(), String> {
     run(&mut script)
 }
 
-/// Makes all pictures in `docs/images`.
+/// Makes all pictures of the documentation.
 pub fn pictures() -> Result<(), String> {
     let environment = libraries()?;
-    install(&environment)?;
+    install_with_agents(&environment)?;
     run(Command::new(environment.join("bin/python")).arg(workspace().join("xtask/pictures/make.py")))
 }
