@@ -31,7 +31,8 @@ def test_the_committed_file_computes_the_committed_vectors(file: Path) -> None:
     recorded = export.record_vectors(loaded.agent, len(committed["features"]))
     for exact in ("reset", "features", "action"):
         assert recorded[exact] == committed[exact]
-    np.testing.assert_allclose(recorded["logits"], committed["logits"], rtol=1e-5, atol=1e-5)
+    # Logits have sizes around 10.
+    np.testing.assert_allclose(recorded["logits"], committed["logits"], rtol=1e-5, atol=1e-4)
     assert sum(recorded["reset"]) >= 2
     # Visitors of the page should see it succeed.
     assert header(file)["evaluation"][0]["success"] > 0.9

@@ -24,9 +24,11 @@ struct Vectors {
     logits: Vec<Vec<f32>>,
 }
 
+/// Relative to the largest number, since smaller ones are differences of terms of its size.
 fn largest_difference(found: &[f32], expected: &[f32]) -> f32 {
     assert_eq!(found.len(), expected.len());
-    found.iter().zip(expected).map(|(a, b)| (a - b).abs() / b.abs().max(1.0)).fold(0.0, f32::max)
+    let size = expected.iter().fold(1.0, |size: f32, number| size.max(number.abs()));
+    found.iter().zip(expected).map(|(a, b)| (a - b).abs() / size).fold(0.0, f32::max)
 }
 
 #[test]
