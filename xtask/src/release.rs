@@ -5,9 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::shell::{
-    cargo, cargo_home, describe, files_below, output, recreate, remap, run, sysroot, target, workspace,
-};
+use crate::shell::{cargo, cargo_home, describe, files_below, recreate, remap, run, sysroot, target, workspace};
 use crate::{python, web};
 
 /// Maturin as in the tests. Zig links against any version of the C library.
@@ -77,17 +75,9 @@ fn only_file(folder: &Path, suffix: &str) -> Result<PathBuf, String> {
 /// archive.
 fn page(folder: &Path) -> Result<(), String> {
     let name = versioned("endless-gym-web");
+    let options = "--create --gzip --sort=name --mtime=@0 --owner=0 --group=0 --numeric-owner --mode=u=rwX,go=rX";
     let mut tar = Command::new("tar");
-    tar.args([
-        "--create",
-        "--gzip",
-        "--sort=name",
-        "--mtime=@0",
-        "--owner=0",
-        "--group=0",
-        "--numeric-owner",
-        "--mode=u=rwX,go=rX",
-    ]);
+    tar.args(options.split(' '));
     tar.arg(format!("--transform=s,^\\.,{name},")).arg("--file").arg(folder.join(format!("{name}.tar.gz")));
     run(tar.arg("--directory").arg(web::folder()?).arg("."))
 }
@@ -187,15 +177,6 @@ pub fn test() -> Result<(), String> {
     build()?;
     let wheel = only_file(&folder()?, ".whl")?;
     let page = if web::Toolchain::find().is_some() { "page" } else { "no page" };
-    if page == "page" {
-        let name = versioned("endless-gym-web");
-        let archive = only_file(&folder()?, &format!("{name}.tar.gz"))?;
-        let files = output(Command::new("tar").args(["--list", "--file"]).arg(&archive))?;
-        let has = |file: &&str| files.lines().any(|line| line == format!("{name}/{file}"));
-        if let Some(missing) = ["index.html", "engine.wasm"].iter().find(|file| !has(file)) {
-            return Err(format!("{} must contain {missing}", archive.display()));
-        }
-    }
     let mut oldest = None;
     for minor in python::SUPPORTED {
         let Some(python) = python::interpreter(minor) else {
