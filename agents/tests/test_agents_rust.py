@@ -131,18 +131,22 @@ def test_a_damaged_or_forged_checkpoint_is_refused(tmp_path: Path) -> None:
         content[:length].tofile(file)
         with pytest.raises(ValueError, match="safetensors"):
             checkpoint.load(file)
+    content.tofile(file)
+    weights, whole = load_file(file), checkpoint.load(file).state
     refused = 0
     for _ in range(100):
         damaged = content.copy()
         damaged[draws.integers(len(content))] ^= draws.integers(1, 256, dtype=np.uint8)
         damaged.tofile(file)
         try:
-            checkpoint.load(file)
+            state = checkpoint.load(file).state
         except ValueError:
             refused += 1
+        else:
+            # As in the name of the checksum's entry.
+            assert all(torch.equal(tensor, state["model"][name]) for name, tensor in whole["model"].items())
     assert refused > 98
     content.tofile(file)
-    weights, whole = load_file(file), checkpoint.load(file).state
     header = {name: whole[name] for name in ("version", "settings", "update", "steps")}
     for text in ("[" * 100_000, '{"a":' * 100_000, "[]", "3", "{}", json.dumps(header | {"settings": 3})):
         save_file(weights, file, {"endless": text})
