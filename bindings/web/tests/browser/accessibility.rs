@@ -84,7 +84,7 @@ fn the_page_tells_what_it_waits_for_and_what_it_lacks() {
     browser.call("Fetch.enable", &json!({"patterns": [{"urlPattern": "*engine.wasm"}]}));
     browser.load(&server.url());
     browser.wait("document.readyState === 'complete'");
-    assert_eq!(browser.value(&text("overlay")), "Loading");
+    assert_eq!(browser.value(&text("said")), "Loading");
     assert_eq!(browser.value("document.getElementById('play').ariaBusy"), "true");
     browser.call("Fetch.disable", &json!({}));
     browser.wait("globalThis.endless?.play.state");

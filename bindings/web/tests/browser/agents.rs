@@ -49,7 +49,7 @@ fn an_agent_plays_from_memory() {
         assert_eq!(kinds.iter().any(|kind| kind == "failed"), done < of);
         successes += u64::from(done == of);
         let expected = if done == of { "Done" } else { "Failed" };
-        assert!(text(&mut browser, "overlay").starts_with(expected), "{}", text(&mut browser, "overlay"));
+        assert!(text(&mut browser, "said").starts_with(expected), "{}", text(&mut browser, "said"));
         let count = format!("Successes: {successes} of {}.", episode + 1);
         assert_eq!(text(&mut browser, "successes"), count);
         browser.press("PageDown");

@@ -33,7 +33,7 @@ fn environments_of_ones_own_are_played() {
     assert_eq!(browser.value(STATE)["action"], json!([2, 4]));
     assert_eq!(browser.value(&text("features")), "move\n2\nlamp\n4");
     assert_eq!(browser.value(action), "→ white");
-    assert!(browser.value(&text("overlay")).as_str().unwrap().starts_with("Episode over: return 5 in 5 steps"));
+    assert!(browser.value(&text("said")).as_str().unwrap().starts_with("Episode over: return 5 in 5 steps"));
 
     visit(&mut browser, &server, "env=Slider-v0&seed=1");
     let kinds = "[...document.querySelectorAll('#action input')].map((input) => [input.type, input.min, input.max])";

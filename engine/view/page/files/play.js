@@ -259,9 +259,6 @@ export class Play {
     const running = this.pace.running;
     $("pause").textContent = running ? "Pause" : state.length === 0 ? "Start" : "Continue";
     $("pause").disabled = $("step").disabled = this.#over();
-    // The next thing to do stands out.
-    $("pause").classList.toggle("first", !this.#over());
-    $("next").classList.toggle("first", this.#over());
     $("expert").disabled = !spec.has_expert;
     for (const player of ["person", "expert", "agent"]) $(player).setAttribute("aria-pressed", String(this.player === player));
     this.#agent();
@@ -269,7 +266,8 @@ export class Play {
     this.say(this.#said(state));
     const text = this.#text();
     $("overlay").hidden = text === "";
-    $("overlay").textContent = text;
+    $("said").textContent = text;
+    $("choices").hidden = !this.#over();
   }
 
   #agent() {
@@ -332,11 +330,10 @@ export class Play {
 
   #listen() {
     const go = () => (this.pace.running ? this.stop() : this.play());
-    const [again, next] = [() => this.restart(), () => this.otherSeed(1)];
+    const tasks = { restart: () => this.restart(), next: () => this.otherSeed(1) };
     $("pause").addEventListener("click", go);
-    $("observation").parentElement.addEventListener("click", go);
-    $("restart").addEventListener("click", again);
-    $("next").addEventListener("click", next);
+    $("observation").parentElement.addEventListener("click", (event) => !event.target.closest("button") && go());
+    for (const button of document.querySelectorAll("[data-do]")) button.addEventListener("click", tasks[button.dataset.do]);
     for (const player of ["person", "expert", "agent"]) $(player).addEventListener("click", () => this.choose(player));
     $("step").addEventListener("click", () => this.oneStep());
     $("pace").addEventListener("input", () => this.setPace(Number($("pace").value)));
@@ -347,11 +344,11 @@ export class Play {
     const keys = {
       Space: go,
       KeyN: () => this.oneStep(),
-      KeyR: again,
+      KeyR: tasks.restart,
       KeyE: toggle("expert"),
       KeyG: toggle("agent"),
-      Enter: next,
-      PageDown: next,
+      Enter: tasks.next,
+      PageDown: tasks.next,
       PageUp: () => this.otherSeed(-1),
     };
     addEventListener("keydown", (event) => {
