@@ -55,6 +55,9 @@ fn an_episode_that_ends_offers_the_next_one_on_the_picture() {
     let (server, mut browser) = (PageServer::start("web"), start("end"));
     let end = "while (!endless.play.state.done) endless.play.oneStep()";
     let shown = "document.getElementById('choices').checkVisibility()";
+    // Each is offered in one place: beside the picture during an episode, and on it afterwards.
+    let offers = "[...document.querySelectorAll('button')].filter((button) => /Again|Next seed/.test(button.textContent) \
+                  && button.checkVisibility({ visibilityProperty: true })).length";
     visit(&mut browser, &server, "env=MortarMayhem-Grid-v0&seed=3");
     let state = |browser: &mut crate::chromium::Chromium| {
         let state = browser.value(STATE);
@@ -63,9 +66,9 @@ fn an_episode_that_ends_offers_the_next_one_on_the_picture() {
     for (act, seed) in
         [("#choices > :first-child", "3"), ("#choices > :last-child", "4"), ("KeyR", "4"), ("Enter", "5")]
     {
-        assert_eq!(browser.value(shown), false);
+        assert_eq!((browser.value(shown), browser.value(offers)), (json!(false), json!(2)));
         browser.value(end);
-        assert_eq!(browser.value(shown), true);
+        assert_eq!((browser.value(shown), browser.value(offers)), (json!(true), json!(2)));
         if act.starts_with('#') {
             browser.click(act);
         } else {

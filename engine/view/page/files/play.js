@@ -268,6 +268,8 @@ export class Play {
     $("overlay").hidden = text === "";
     $("said").textContent = text;
     $("choices").hidden = !this.#over();
+    // On the picture then; their places stay, so that nothing moves.
+    for (const id of ["restart", "next"]) $(id).style.visibility = this.#over() ? "hidden" : "";
   }
 
   #agent() {
