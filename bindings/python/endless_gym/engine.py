@@ -65,7 +65,12 @@ class EngineProcess:
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
-                raise RuntimeError(self._log.message() or f"the engine ended with status {status}")
+                ended = f"ended with status {status}"
+                if status < 0:
+                    ended = f"was ended by a signal, {signal.strsignal(-status)}"
+                if status == -signal.SIGKILL:
+                    ended += ", as the system does where a container or a batch job has used up its memory"
+                raise RuntimeError(self._log.message() or f"the engine {ended}")
             if self.service in _native.running_engines():
                 envs = connect(self.service, timeout=timeout, engine=self, **kwargs)
                 self._clients.append(envs._backend)

@@ -69,9 +69,11 @@ pub fn service(error: ServiceError) -> PyErr {
         | E::OptionsTooLong { .. }
         | E::SnapshotTooLong { .. }
         | E::Rejected { .. } => PyValueError::new_err(text),
-        E::Root { .. } | E::ForeignSegment { .. } | E::DescriptorLimit { .. } | E::ResourceLimit { .. } => {
-            PyOSError::new_err(text)
-        }
+        E::Root { .. }
+        | E::ForeignSegment { .. }
+        | E::DescriptorLimit { .. }
+        | E::ResourceLimit { .. }
+        | E::MemoryLimit { .. } => PyOSError::new_err(text),
         _ => PyRuntimeError::new_err(text),
     }
 }

@@ -1,10 +1,11 @@
-"""Who can use the files of engines, which directories and names are refused, and what a failing observer does to an engine."""
+"""Who can use the files of engines, which directories and names are refused, and what limits of resources do."""
 
 import contextlib
 import os
+import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,6 +14,7 @@ import pytest
 from support import engine_of_program, segments
 
 import endless_gym
+from endless_gym.program import program
 
 ID = "MortarMayhem-Grid-v0"
 
@@ -134,4 +136,59 @@ with endless_gym.watch("gym", timeout=5) as batches:
         assert observer.returncode == 1 and option in error[-1], error
         for _ in range(3):
             envs.step(actions)
+    assert not segments()
+
+
+@pytest.fixture
+def group() -> Iterator[Callable[[str, int], Path]]:
+    """Makes control groups with a limit, for which a test needs root, or a group of its own that it may divide."""
+    made = []
+
+    def make(controller: str, limit: int) -> Path:
+        root = Path("/sys/fs/cgroup")
+        is_v2 = (root / "cgroup.controllers").exists()
+        folder = (root if is_v2 else root / controller) / f"endless-{os.getpid()}"
+        names = {"pids": "pids.max", "memory": "memory.max" if is_v2 else "memory.limit_in_bytes"}
+        try:
+            folder.mkdir()
+            made.append(folder)
+            (folder / names[controller]).write_text(str(limit))
+        except OSError as error:
+            pytest.skip(f"control groups cannot be made here: {error}")
+        return folder
+
+    yield make
+    for folder in made:
+        folder.rmdir()
+
+
+@pytest.mark.parametrize(
+    ("controller", "limit", "num_envs", "message"),
+    [
+        *(("pids", limit, 4, r"cannot start (a thread|[0-9] threads): Resource temporarily") for limit in range(1, 6)),
+        ("memory", 200 << 20, 8192, "control group of this process .* is limited to 209 MB"),
+        ("memory", 4 << 20, 4, "Killed, as the system does where a container or a batch job"),
+    ],
+)
+def test_an_engine_says_which_limit_of_its_control_group_is_too_low(
+    controller: str,
+    limit: int,
+    num_envs: int,
+    message: str,
+    group: Callable[[str, int], Path],
+    parent: Path,
+    tmp_path: Path,
+) -> None:
+    """The last limit is too low for the program."""
+    folder, start = group(controller, limit), tmp_path / "start"
+    start.write_text(f"""#!/bin/sh\necho $$ > {folder}/cgroup.procs\nexec {shlex.join(program())} "$@"\n""")
+    start.chmod(0o755)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endless_gym.engine.program", lambda native: [str(start)])
+        with pytest.raises(RuntimeError, match=message) as raised:
+            endless_gym.serve(ID, num_envs, num_threads=4)
+    assert "\n" not in str(raised.value)
+    # The next engine removes what a killed one left.
+    with endless_gym.serve(ID, 4) as envs:
+        envs.reset(seed=1)
     assert not segments()

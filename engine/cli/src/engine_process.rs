@@ -6,7 +6,7 @@ use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStderr, Command, Stdio};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use endless_gym_service::{ConnectConfig, EngineConfig, ServiceError, Trainer};
@@ -69,7 +69,11 @@ impl EngineProcess {
             .process_group(0)
             .spawn()?;
         // In a thread, because a child blocks when the pipe is full.
-        let stderr = child.stderr.take().map(|stderr| std::thread::spawn(|| read_message(stderr)));
+        let reads = |stderr| thread::Builder::new().name("stderr".to_owned()).spawn(|| read_message(stderr));
+        let stderr = child.stderr.take().map(reads).transpose();
+        let stderr = stderr.inspect_err(|_| {
+            let _ = child.kill().and_then(|()| child.wait());
+        })?;
         let config = ConnectConfig { timeout: POLL_INTERVAL, ..config };
         Ok(EngineProcess { child, stderr, config })
     }

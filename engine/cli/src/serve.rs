@@ -129,7 +129,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     let mut config = args.config.as_deref().map_or_else(|| args.engine.configure(), read)?;
     let stop = stop::on_signal()?;
     if let Some(parent) = args.child {
-        stop::with_parent(stop, parent);
+        stop::with_parent(stop, parent)?;
     }
     let bind = |address| MetricsServer::bind(address).map_err(|error| format!("--metrics {address}: {error}"));
     let metrics = args.metrics.map(bind).transpose()?;

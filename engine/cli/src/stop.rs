@@ -46,7 +46,12 @@ pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
             std::process::exit(INTERRUPTED);
         }
     };
-    let set = || ctrlc::set_handler(stop).map_err(|error| error.to_string());
+    let set = || {
+        ctrlc::set_handler(stop).map_err(|error| match error {
+            ctrlc::Error::System(error) => no_thread(error),
+            _ => error.to_string(),
+        })
+    };
     HANDLER.get_or_init(set).clone()?;
     *FIRST_SIGNAL.lock().unwrap_or_else(PoisonError::into_inner) = None;
     STOP.store(false, Ordering::Relaxed);
@@ -80,19 +85,31 @@ pub fn wait(stop: &AtomicBool, time: Duration) -> bool {
 /// Sets the flag when the parent process requests it or ends: on a byte on standard input, when it closes, or when
 /// `parent` is no longer this process's parent. Standard input alone would not do, since other children that the parent
 /// has forked keep it open.
-pub fn with_parent(stop: &'static AtomicBool, parent: Option<u32>) {
-    std::thread::spawn(move || {
+///
+/// # Errors
+///
+/// A thread cannot be started.
+pub fn with_parent(stop: &'static AtomicBool, parent: Option<u32>) -> Result<(), Failure> {
+    let thread = |name: &str| std::thread::Builder::new().name(name.to_owned());
+    let input = thread("input").spawn(move || {
         let _ = std::io::stdin().read(&mut [0]);
         stop.store(true, Ordering::Relaxed);
     });
+    input.map_err(no_thread)?;
     if let Some(parent) = parent {
-        std::thread::spawn(move || {
+        let ended = move || {
             while parent_id() == parent {
                 std::thread::sleep(PARENT_INTERVAL);
             }
             stop.store(true, Ordering::Relaxed);
-        });
+        };
+        thread("parent").spawn(ended).map_err(no_thread)?;
     }
+    Ok(())
+}
+
+fn no_thread(error: std::io::Error) -> String {
+    format!("cannot start a thread: {error}")
 }
 
 #[cfg(test)]

@@ -49,7 +49,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let stop = stop::on_signal()?;
     if let Some(parent) = args.child {
-        stop::with_parent(stop, parent);
+        stop::with_parent(stop, parent)?;
     }
     let (server, _page) = announce(args.service.as_deref(), args.page.port, args.page.open)?;
     if args.child.is_none() {

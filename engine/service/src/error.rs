@@ -183,6 +183,18 @@ pub enum ServiceError {
         /// The file system.
         path: &'static str,
     },
+    /// The control group of this process may not have as much memory.
+    #[error(
+        "{} MB of shared memory are needed, and the control group of this process (a container or a batch job) is limited to {} MB; \
+         use fewer environments or groups, or raise the limit (`docker run --memory`, `sbatch --mem`)",
+        megabytes(*needed), limit / 1_000_000
+    )]
+    MemoryLimit {
+        /// Bytes that are needed.
+        needed: u64,
+        /// Bytes that the group may have.
+        limit: u64,
+    },
     /// The process may not open enough file descriptors.
     #[error(
         "{needed} file descriptors are needed, and the limit of this process is {limit}; raise it with `ulimit -n {needed}`, or use \

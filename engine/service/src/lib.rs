@@ -54,6 +54,7 @@
 //! | situation | behaviour |
 //! | --- | --- |
 //! | `/dev/shm` is full, or the limit of file descriptors is too low | [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] before iceoryx2 creates anything; the soft limit of descriptors is raised if the hard limit permits it |
+//! | the control group of the process (a container, a batch job) may have less memory than shared memory needs | [`ServiceError::MemoryLimit`] before iceoryx2 creates anything; SIGKILL by the system if the rest of the process uses up the limit |
 //! | the address space or the size of files is limited (`ulimit -v`, `ulimit -f`) | [`ServiceError::ResourceLimit`], which names the limit; the program `endless` blocks `SIGXFSZ`, which would end a process without cleanup |
 //! | another process uses up `/dev/shm` while a process connects or starts | SIGBUS may kill the connecting process, since iceoryx2 allocates no memory in advance; processes that are connected already have their memory |
 //! | a process dies while it creates something | the next process that gets the locks removes it, however recent it is; nothing incomplete is removed while a living process creates something, even if that process is stopped |

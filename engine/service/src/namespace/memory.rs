@@ -5,6 +5,7 @@
 //! use, and missing memory is an error.
 
 use std::mem::MaybeUninit;
+use std::path::Path;
 
 use rustix::io::Errno;
 use rustix::mm::Advice;
@@ -21,9 +22,32 @@ pub(crate) const MARGIN: u64 = 1 << 20;
 pub(crate) const NODE_BYTES: u64 = 64 << 10;
 
 /// Fails if `/dev/shm` has fewer than `needed` bytes free. iceoryx2 writes to a new segment without allocating it first, which
-/// raises SIGBUS if there is no memory.
+/// raises SIGBUS if there is no memory, and SIGKILL if the control group may not have as much.
 pub(crate) fn check_free(needed: u64) -> Result<(), ServiceError> {
-    available().map_or(Ok(()), |available| check(needed, available))
+    available().map_or(Ok(()), |available| check(needed, available))?;
+    match control_group_limit() {
+        Some(limit) if limit < needed => Err(ServiceError::MemoryLimit { needed, limit }),
+        _ => Ok(()),
+    }
+}
+
+/// The smallest memory limit of the control groups of this process, in bytes, of version 1 or 2 (cgroups(7)).
+fn control_group_limit() -> Option<u64> {
+    let groups = std::fs::read_to_string("/proc/self/cgroup").ok()?;
+    let limits = groups.lines().filter_map(|line| {
+        let (controllers, group) = line.split_once(':')?.1.split_once(':')?;
+        let (mount, file) = match controllers {
+            "" => ("/sys/fs/cgroup", "memory.max"),
+            "memory" => ("/sys/fs/cgroup/memory", "memory.limit_in_bytes"),
+            _ => return None,
+        };
+        // A group is also limited by those above it. A container may see only its own, as the root.
+        let limit = |group: &Path| {
+            std::fs::read_to_string(format!("{mount}{}/{file}", group.display())).ok()?.trim().parse().ok()
+        };
+        Path::new(group).ancestors().filter_map(limit).min()
+    });
+    limits.min()
 }
 
 /// The addresses of the chunks that have been prefaulted.
