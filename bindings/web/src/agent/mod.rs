@@ -171,12 +171,14 @@ fn network_spec(settings: &Settings, tensors: &SafeTensors) -> Result<NetworkSpe
     let count = |name: &dyn Fn(usize) -> String| (0..MAX_LAYERS).take_while(|layer| has(&name(*layer))).count();
     let (memory, layers, hidden_size) = match &*settings.agent {
         "gru" => (Layers::Gru, count(&gru), size("memory.recurrent.weight_hh_l0", 1)?),
-        "mingru" => (Layers::MinGru, count(&mingru), size(&mingru(0), 0)? / 2),
+        "mingru" => (Layers::MinGru, count(&mingru), size(&mingru(0), 0)?.div_ceil(2)),
         "none" => (Layers::Gru, 0, 1),
         given => return Err(AgentFileError::Kind { given: given.to_owned() }),
     };
     let branch = |branch: usize| format!("policy.branches.{branch}.weight");
-    let choices = (0..MAX_LAYERS).map(branch).take_while(|name| has(name)).map(|name| size(&name, 0));
+    // Without the first one, that is an error.
+    let branches = (0..MAX_LAYERS).map(branch).take_while(|name| has(name) || *name == branch(0));
+    let choices = branches.map(|name| size(&name, 0));
     Ok(NetworkSpec {
         observation_width: size("encoder.vector.0.weight", 1)?,
         encoder_width: size("encoder.vector.0.weight", 0)?,

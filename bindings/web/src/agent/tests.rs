@@ -151,3 +151,34 @@ fn a_broken_file_is_refused() {
     assert_eq!(bias.to_string(), text);
     assert!(matches!(replaced("\"shape\":[32,17]", "\"shape\":[17,32]"), AgentFileError::Tensor { .. }));
 }
+
+#[test]
+fn a_damaged_file_is_refused_or_plays() {
+    let draws = &mut Generator::from_seed(35);
+    let header = u64::from_le_bytes(AGENT[..8].try_into().unwrap()) as usize;
+    let words =
+        ["0", "-1", "4096", "1e400", "18446744073709551615", "null", "[]", "{", "\"", "\\", "F64", "[[[[", "gru", ""];
+    let (mut refused, mut played) = (0, 0);
+    for _ in 0..2_000 {
+        let mut text = AGENT[8..8 + header].to_vec();
+        for _ in 0..draws.integers(1, 4) {
+            let start = draws.integers(0, text.len() as i64) as usize;
+            let end = (start + draws.integers(0, 8) as usize).min(text.len());
+            text.splice(start..end, draws.choice(&words).bytes());
+        }
+        let file = [&(text.len() as u64).to_le_bytes(), &text[..], &AGENT[8 + header..]].concat();
+        match Agent::read(&file) {
+            Err(_) => refused += 1,
+            Ok(agent) => {
+                let features = vec![1.0; agent.network.spec.observation_width];
+                let mut action = vec![-1; agent.network.spec.choices.len()];
+                agent.act(&features, &mut agent.memory(1), &mut action);
+                let choices = agent.network.spec.choices.iter().map(|choices| *choices as i32);
+                assert!(action.iter().zip(choices).all(|(action, choices)| (0..choices).contains(action)));
+                assert!(agent.description().is_object());
+                played += 1;
+            }
+        }
+    }
+    assert!(refused > 500 && played > 100, "{refused} refused, {played} played");
+}
