@@ -2,10 +2,12 @@
 
 import json
 import re
+import resource
 import signal
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -194,6 +196,33 @@ def test_signals_end_a_run_with_a_checkpoint_and_a_killed_one_resumes(tmp_path: 
     with locked(run):
         assert "in use by process" in learn(f"--resume {run} --ppo.updates 1", fails=True)
     assert f"{updates} of 1 updates done" in learn(f"--resume {run} --ppo.updates 1")
+
+
+def test_a_run_killed_at_any_moment_or_with_a_full_disk_keeps_a_whole_checkpoint(tmp_path: Path) -> None:
+    run, draws, last = tmp_path / "run", np.random.default_rng(35), 0
+    file = run / "checkpoints" / "last.safetensors"
+    for _ in range(5):
+        with training(run) as process:
+            # Each update saves, which takes most of its time.
+            time.sleep(draws.uniform(0, 0.1))
+            process.kill()
+        saved = checkpoint.load(run).update
+        assert saved >= last
+        last = saved
+    former = file.read_bytes()
+    for limit in (0, 1, len(former) // 2):
+        process = subprocess.run(
+            [*PROGRAM, "--resume", str(run), "--ppo.updates", str(last + 1)],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),  # noqa: B023
+        )
+        assert process.returncode == 1 and "File too large" in process.stderr.splitlines()[-1], process.stderr
+        assert file.read_bytes() == former
+    assert {each.name for each in file.parent.iterdir()} == {file.name}
+    learn(f"--resume {run} --ppo.updates {last + 1}")
+    assert checkpoint.load(run).update == last + 1
 
 
 @contextmanager
