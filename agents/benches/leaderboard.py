@@ -127,8 +127,9 @@ def table(track: dict[str, Any], rows: list[dict[str, Any]]) -> str:
         track["about"],
         "",
         "Scores are normalised for each task: 0 is the agent `none`, without memory, and 1 the scripted expert. IQM is the",
-        "interquartile mean over all tasks and seeds, with its 95 % interval by stratified bootstrap. Acting and learning are",
-        "environment steps per second in that phase of training; they depend on the machine.",
+        "interquartile mean over all tasks and seeds, with its 95 % interval by stratified bootstrap. The expert sees the whole",
+        "state, so 1 minus a score is the gap to the fully observable task. Acting and learning are environment steps per second",
+        "in that phase of training, in the run that other work disturbed least; they depend on the machine.",
         "",
         "| agent | size | IQM | 95 % | " + " | ".join(tasks) + " | parameters | acting | learning | bytes of state |",
         "| --- | --- | ---: | --- |" + " ---: |" * (len(tasks) + 4),
@@ -152,10 +153,8 @@ def table(track: dict[str, Any], rows: list[dict[str, Any]]) -> str:
             summary = summarise(np.array(normalised))
             iqm, interval = summary.iqm, f"{summary.low:.2f} to {summary.high:.2f}"
         cells = [f"{means[task]:.2f}" if task in means else "" for task in tasks]
-        numbers = [
-            f"{statistics.median(one[key] for one in own):,.0f}"
-            for key in ("parameters", "acting", "learning", "state_bytes")
-        ]
+        largest = [max(one[key] for one in own) for key in ("acting", "learning", "state_bytes")]
+        numbers = [f"{number:,.0f}" for number in (statistics.median(one["parameters"] for one in own), *largest)]
         shown = f"{iqm:.2f}" if iqm == iqm else ""
         body.append(
             (-iqm if iqm == iqm else 1e9, " | ".join([f"| `{agent}`", size, shown, interval, *cells, *numbers]) + " |")

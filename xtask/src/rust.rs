@@ -98,7 +98,8 @@ pub fn test_faults() -> Result<(), String> {
 
 /// Builds the program of `tests/faults` and the engine that it starts, and runs one of the program's commands.
 pub fn faults(command: &str, arguments: &[String]) -> Result<(), String> {
-    cargo(&["build", "--locked", "--package", "endless-gym", "--package", "endless-gym-faults", "--bins"])?;
+    // With all tests, as they were built before: alone, the programs would have dependencies with other features.
+    cargo(&["build", "--locked", "--workspace", "--bins", "--tests"])?;
     run(Command::new(target()?.join("debug/endless-gym-faults")).arg(command).args(arguments))
 }
 
