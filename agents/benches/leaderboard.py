@@ -112,15 +112,46 @@ def longer(agent: Agent, task: Task, seeds: int) -> float:
         agent.settings = trained
 
 
+def zeros(track: dict[str, Any], rows: list[dict[str, Any]]) -> dict[str, float]:
+    """The mean score of `none` on each task that it was trained on."""
+    found = {
+        task: [one["score"] for one in rows if (one["agent"], one["task"]) == ("none", task)] for task in track["tasks"]
+    }
+    return {task: statistics.mean(scores) for task, scores in found.items() if scores}
+
+
+def summaries(track: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The normalised scores of each agent and size, the best first, and after them those with missing runs."""
+    tasks, zero = track["tasks"], zeros(track, rows)
+    scores = {tuple(one[key] for key in KEYS): one["score"] for one in rows}
+    found = []
+    for agent, size in sorted({(one["agent"], one["size"]) for one in rows}):
+        own = [one for one in rows if (one["agent"], one["size"]) == (agent, size)]
+        seeds = sorted({one["seed"] for one in own})
+        means = {
+            task: statistics.mean(
+                TASKS[task].normalised(one["score"], zero[task]) for one in own if one["task"] == task
+            )
+            for task in tasks
+            if task in zero and any(one["task"] == task for one in own)
+        }
+        one = {"agent": agent, "size": size, "tasks": {task: round(mean, 4) for task, mean in means.items()}}
+        if all((agent, size, task, seed) in scores and task in zero for task in tasks for seed in seeds):
+            normalised = [
+                [TASKS[task].normalised(scores[agent, size, task, seed], zero[task]) for task in tasks]
+                for seed in seeds
+            ]
+            summary = summarise(np.array(normalised))
+            one |= {"seeds": len(seeds), "iqm": summary.iqm, "low": summary.low, "high": summary.high}
+        one["parameters"] = statistics.median(row["parameters"] for row in own)
+        one |= {key: max(row[key] for row in own) for key in ("acting", "learning", "state_bytes")}
+        found.append(one)
+    return sorted(found, key=lambda one: -one.get("iqm", -1e9))
+
+
 def table(track: dict[str, Any], rows: list[dict[str, Any]]) -> str:
     """The page of a track, Markdown."""
-    tasks = track["tasks"]
-    scores = {tuple(one[key] for key in KEYS): one["score"] for one in rows}
-    zeros = {
-        task: statistics.mean(found)
-        for task in tasks
-        if (found := [one["score"] for one in rows if one["task"] == task and one["agent"] == "none"])
-    }
+    tasks, zero, found = track["tasks"], zeros(track, rows), summaries(track, rows)
     lines = [
         f"# Memories: {track['name']} track",
         "",
@@ -131,41 +162,28 @@ def table(track: dict[str, Any], rows: list[dict[str, Any]]) -> str:
         "state, so 1 minus a score is the gap to the fully observable task. Acting and learning are environment steps per second",
         "in that phase of training, in the run that other work disturbed least; they depend on the machine.",
         "",
+    ]
+    if (FOLDER / f"{track['name']}-light.svg").exists():
+        picture = f'<source media="(prefers-color-scheme: dark)" srcset="{track["name"]}-dark.svg">'
+        text = "interquartile mean of each memory with its interval, and its mean in each task"
+        lines += [f'<picture>{picture}<img src="{track["name"]}-light.svg" alt="{text}"></picture>', ""]
+    lines += [
         "| agent | size | IQM | 95 % | " + " | ".join(tasks) + " | parameters | acting | learning | bytes of state |",
         "| --- | --- | ---: | --- |" + " ---: |" * (len(tasks) + 4),
     ]
-    body = []
-    for agent, size in sorted({(one["agent"], one["size"]) for one in rows}):
-        own = [one for one in rows if (one["agent"], one["size"]) == (agent, size)]
-        seeds = sorted({one["seed"] for one in own})
-        means = {
-            task: statistics.mean(
-                TASKS[task].normalised(one["score"], zeros[task]) for one in own if one["task"] == task
-            )
-            for task in {one["task"] for one in own} & zeros.keys()
-        }
-        iqm, interval = float("nan"), "incomplete"
-        if all((agent, size, task, seed) in scores and task in zeros for task in tasks for seed in seeds):
-            normalised = [
-                [TASKS[task].normalised(scores[agent, size, task, seed], zeros[task]) for task in tasks]
-                for seed in seeds
-            ]
-            summary = summarise(np.array(normalised))
-            iqm, interval = summary.iqm, f"{summary.low:.2f} to {summary.high:.2f}"
-        cells = [f"{means[task]:.2f}" if task in means else "" for task in tasks]
-        largest = [max(one[key] for one in own) for key in ("acting", "learning", "state_bytes")]
-        numbers = [f"{number:,.0f}" for number in (statistics.median(one["parameters"] for one in own), *largest)]
-        shown = f"{iqm:.2f}" if iqm == iqm else ""
-        body.append(
-            (-iqm if iqm == iqm else 1e9, " | ".join([f"| `{agent}`", size, shown, interval, *cells, *numbers]) + " |")
-        )
-    lines += [line for _, line in sorted(body)]
+    for one in found:
+        shown = ["", "incomplete"]
+        if "iqm" in one:
+            shown = [f"{one['iqm']:.2f}", f"{one['low']:.2f} to {one['high']:.2f}"]
+        cells = [f"{one['tasks'][task]:.2f}" if task in one["tasks"] else "" for task in tasks]
+        numbers = [f"{one[key]:,.0f}" for key in ("parameters", "acting", "learning", "state_bytes")]
+        lines.append(" | ".join([f"| `{one['agent']}`", one["size"], *shown, *cells, *numbers]) + " |")
     lines += ["", "| task | measures | expert | `none` | gate |", "| --- | --- | ---: | ---: | --- |"]
     for task in (TASKS[name] for name in tasks):
-        zero = zeros.get(task.name)
-        gate = "" if zero is None else "passed" if task.passes_gate(zero) else "FAILED"
+        score = zero.get(task.name)
+        gate = "" if score is None else "passed" if task.passes_gate(score) else "FAILED"
         lines.append(
-            f"| {task.name} | {task.label} | {task.expert:g} | {'' if zero is None else f'{zero:.3f}'} | {gate} |"
+            f"| {task.name} | {task.label} | {task.expert:g} | {'' if score is None else f'{score:.3f}'} | {gate} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -230,8 +248,10 @@ def main() -> None:
         "torch": torch.__version__,
     }
     lines = ",\n".join(json.dumps(rows[key]) for key in sorted(rows, key=str))
+    summary = ",\n".join(map(json.dumps, summaries(track, list(rows.values()))))
     results.write_text(
-        f'{{"track": {json.dumps(args.track)}, "machine": {json.dumps(machine)}, "rows": [\n{lines}\n]}}\n'
+        f'{{"track": {json.dumps(args.track)}, "machine": {json.dumps(machine)}, "summary": [\n{summary}\n], "rows": [\n'
+        f"{lines}\n]}}\n"
     )
     results.with_name(f"{results.name.partition('.')[0]}.md").write_text(table(track, list(rows.values())))
     print(f"{len(rows)} rows in {results}")
