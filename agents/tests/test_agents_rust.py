@@ -19,7 +19,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from endless_gym_agents import checkpoint, export, plot, ppo, protocol
+from endless_gym_agents import checkpoint, enjoy, export, plot, ppo, protocol
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.command import STOP_SIGNALS
@@ -108,6 +108,12 @@ def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     row = read_progress(run)[-1]
     assert [event.step for event in events.Scalars("learning/loss")] == [128, 256, 384]
     assert events.Scalars("episode/reward")[-1].value == pytest.approx(row["episode/reward"])
+
+
+def test_an_episode_of_a_run_is_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, picture = new_run(tmp_path / "run", "--agent mingru --ppo.updates 1"), tmp_path / "episode.gif"
+    monkeypatch.setattr(sys, "argv", ["endless-enjoy", str(run), "--seeds", "200000", "--out", str(picture)])
+    assert enjoy.main() == 0 and picture.stat().st_size > 1_000
 
 
 def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
