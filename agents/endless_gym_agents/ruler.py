@@ -91,6 +91,7 @@ TASKS = {
     task.name: task
     for task in (
         _mayhem("one-command", "object", 0.1, 0.0185, ("command_count=[1]",), ("command_count=[2]",)),
+        _mayhem("two-commands", "sequential", 0.2, 0.0195, ("command_count=[2]",), ("command_count=[3]",)),
         _mayhem("three-commands", "sequential", 0.3, 0.0177, ("command_count=[3]",), ("command_count=[5]",)),
         _mayhem("ten-commands", "sequential", 1.0, 0.0223, ("command_count=[10]",), ("command_count=[15]",)),
         _mayhem("late-command", "object", 0.1, 0.0143, _LATE, (_LATE[0], "command_show_delay=[60]")),
