@@ -99,11 +99,11 @@ pub mod raster {
 #[cfg(not(target_arch = "wasm32"))]
 pub mod service {
     pub use endless_gym_service::{
-        BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,
-        EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus, LastRequest,
-        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed, Observer, ObserverStatus, Observers,
-        ROOT_VARIABLE, Reconnection, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
-        timeout_from_seconds,
+        BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Drawn, Engine,
+        EngineActivity, EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus,
+        LastRequest, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed, Observer, ObserverStatus,
+        Observers, Pictures, ROOT_VARIABLE, Reconnection, Rejection, ServiceError, ServiceSpecification, Trainer,
+        running_engines, timeout_from_seconds,
     };
 }
 

@@ -9,8 +9,9 @@ use std::time::Duration;
 use crate::support::chromium::{Chromium, REBOUND};
 use crate::support::page::Server;
 use crate::support::place::Place;
+use crate::support::player::Player;
 use crate::support::process::Process;
-use endless_gym::pool::ResetRequest;
+use endless_gym::pool::{PoolConfig, ResetRequest};
 use serde_json::Value as Json;
 
 const ID: &str = "MortarMayhem-Grid-v0";
@@ -135,6 +136,35 @@ fn a_running_engine_is_shown_lost_and_found() {
     browser.value("globalThis.shown = endless.frames; 0");
     browser.wait("endless.frames > shown + 3");
     training.end();
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs Chromium"]
+fn an_engine_without_frames_draws_for_the_page() {
+    let place = Place::new();
+    let _engine = place.serve(&["--env", ID, "--num-envs", "3", "--features", "--no-frames"]);
+    let server = Server::start(place.endless(&["view", "endless"]));
+    let mut browser = start("view-features");
+    browser.load(&server.url);
+    browser.wait("document.getElementById('state')?.textContent === 'no trainer'");
+    let mut trainer = place.trainer("endless").unwrap();
+    let mut twin = Player::new(&PoolConfig::new(ID, 3));
+    crate::support::service::reset(&mut trainer, 0);
+    twin.reset(ResetRequest::Seed(3));
+    browser.wait(SHOWN);
+    (0..3).for_each(|env| assert_shown(&mut browser, &grid(env), twin.batch().observation(), env));
+    for hidden in ["no-frames", "nothing"] {
+        assert_eq!(browser.value(&format!("document.getElementById('{hidden}').checkVisibility()")), false, "{hidden}");
+    }
+    // The numbers are below the pictures.
+    let numbers = "document.querySelectorAll('#values tr').length";
+    assert_eq!(
+        (browser.value(numbers), browser.value("document.getElementById('rows').checkVisibility()")),
+        (3.into(), true.into())
+    );
+    browser.value("document.querySelectorAll('#grid button')[2].click()");
+    assert_shown(&mut browser, "document.getElementById('enlarged')", twin.batch().observation(), 2);
     assert_eq!(browser.complaints, Vec::<String>::new());
 }
 

@@ -125,6 +125,34 @@ proptest! {
     }
 }
 
+/// A pool without frames draws the frames that a pool with frames has, and drawing them changes nothing.
+#[test]
+fn a_single_frame_equals_the_observation_even_without_frames_in_the_batch() {
+    for spec in memory_gym().specs() {
+        for autoreset in [Autoreset::SameStep, Autoreset::NextStep] {
+            let with = |frames| pool(&PoolConfig { features: true, frames, autoreset, ..config(spec) });
+            let (mut seen, mut drawn) = (with(Some(Frames::default())), with(None));
+            assert!(matches!(drawn.frame(0), Err(PoolError::NotReset)));
+            let mut buffers = [&seen, &drawn].map(|pool| zeroed(pool.layout().blocks()));
+            let mut random = SmallRng::seed_from_u64(2);
+            seen.reset(ResetRequest::All, &mut buffers[0]).unwrap();
+            drawn.reset(ResetRequest::All, &mut buffers[1]).unwrap();
+            for step in 0..150 {
+                let observation = Batch::new(seen.layout(), &buffers[0]).observation().to_vec();
+                for (env, expected) in observation.chunks_exact(FRAME.bytes()).enumerate() {
+                    assert!(drawn.frame(env).unwrap() == expected, "{} step {step} environment {env}", spec.id);
+                }
+                let actions = random_actions(spec, NUM_ENVS, &mut random);
+                seen.step(&actions, &mut buffers[0]).unwrap();
+                drawn.step(&actions, &mut buffers[1]).unwrap();
+            }
+            let features = |pool: &Pool, blocks: &[Block]| Batch::new(pool.layout(), blocks).features().to_vec();
+            assert_eq!(features(&seen, &buffers[0]), features(&drawn, &buffers[1]));
+            assert!(matches!(drawn.frame(NUM_ENVS), Err(PoolError::NoSuchEnv { given: NUM_ENVS, num_envs: NUM_ENVS })));
+        }
+    }
+}
+
 /// Shows that the check can fail.
 #[test]
 fn the_drawing_check_finds_a_changed_pixel() {

@@ -26,6 +26,7 @@ mod service_faults;
 mod service_forged;
 mod service_frames;
 mod service_pause;
+mod service_pictures;
 mod service_promise;
 mod service_snapshots;
 mod serving;

@@ -72,10 +72,10 @@ fn frames_are_right<const WIDTH: usize, const HEIGHT: usize, const CHANNELS: usi
         let expected = if stack == 1 { shape.to_vec() } else { [vec![stack], shape.to_vec()].concat() };
         let section = player.pool.layout().section(BatchSection::Observation).unwrap();
         assert_eq!(section.shape(), expected);
+        let length = WIDTH * HEIGHT * CHANNELS;
         for _ in 0..10 {
             player.step_all(0);
             let batch = player.batch();
-            let length = WIDTH * HEIGHT * CHANNELS;
             for (row, features) in
                 batch.observation().chunks_exact(length * stack).zip(batch.features().chunks_exact(2))
             {
@@ -94,6 +94,14 @@ fn frames_are_right<const WIDTH: usize, const HEIGHT: usize, const CHANNELS: usi
                 assert_eq!(newest.iter().filter(|byte| **byte != 0).count(), CHANNELS);
             }
         }
+        let plain = PoolConfig { features: true, ..PoolConfig::new(ID, 3) };
+        let [mut with, mut without] = [Some(Frames::default()), None]
+            .map(|frames| Player::in_registry(&registry, &PoolConfig { frames, ..plain.clone() }, 1));
+        for player in [&mut with, &mut without] {
+            player.reset(ResetRequest::Seed(1));
+            player.step_all(0);
+        }
+        assert_eq!(without.pool.frame(1).unwrap(), with.batch().observation().chunks(length).nth(1).unwrap());
         let view = player.pool.ground_truth_view(0).unwrap();
         assert_eq!((view.width, view.height, view.pixels.len()), (4 * WIDTH, 4 * HEIGHT, 16 * 3 * WIDTH * HEIGHT));
         assert!(view.pixels.iter().any(|byte| *byte != 0));
@@ -132,6 +140,7 @@ fn an_environment_without_frames_always_has_its_features() {
         "the action of environment 0 must be in Box([-1.0, -2.0], [1.0, inf]), got [0.0, NaN]"
     );
     assert!(matches!(player.pool.ground_truth_view(0), Err(PoolError::NoFrame { id: ID })));
+    assert!(matches!(player.pool.frame(0), Err(PoolError::NoFrame { id: ID })));
 }
 
 #[test]

@@ -128,9 +128,9 @@ fn frames_equal_the_bytes_of_the_batch_in_every_format() {
 }
 
 #[test]
-fn a_page_shows_numbers_if_there_are_no_frames() {
+fn a_page_shows_numbers_of_environments_without_frames() {
     let place = Place::new();
-    let arguments = ["--env", "MortarMayhem-v0", "--num-envs", "3", "--groups", "2", "--no-frames", "--features"];
+    let arguments = ["--env", "popgym-RepeatFirstEasy-v0", "--num-envs", "3", "--groups", "2"];
     let _engine = place.serve(&arguments);
     let server = Server::start(place.endless(&["view", "endless"]));
     let mut trainer = place.trainer("endless").unwrap();
@@ -141,11 +141,56 @@ fn a_page_shows_numbers_if_there_are_no_frames() {
     let lease = trainer.receive(1, TIMEOUT).unwrap();
     let (about, pixels) = socket.wait(|about| about["batch"]["group"] == 1);
     assert!(pixels.is_empty());
-    assert_eq!(about["batch"]["frame"], json!(null));
+    assert_eq!((&about["has_frames"], &about["batch"]["frame"]), (&json!(false), &json!(null)));
     let features = trainer.specification().features.clone();
     assert_eq!(about["batch"]["features"], json!(features));
     assert_eq!(about["batch"]["envs"].as_array().unwrap().len(), 1, "there are three environments");
     assert_eq!(about["batch"]["envs"][0]["features"], json!(lease.batch().features()[2 * features.len()..]));
+}
+
+#[test]
+fn an_engine_without_frames_draws_what_a_page_shows() {
+    let place = Place::new();
+    let id = "MortarMayhem-v0";
+    let _engine = place.serve(&["--env", id, "--num-envs", "6", "--no-frames", "--features"]);
+    let server = Server::start(place.endless(&["view", "endless"]));
+    let mut trainer = place.trainer("endless").unwrap();
+    let mut twin = Player::new(&PoolConfig::new(id, 6));
+    let mut sockets = [server.show("endless"), server.show("endless")];
+    sockets[0].select(0, &[5, 2]);
+    sockets[1].select(0, &[0]);
+    let mut shown =
+        sockets.each_mut().map(|socket| socket.wait(|about| about["state"] == "live").0["has_frames"].take());
+    assert!(shown.iter_mut().all(|shown| shown == true));
+    reset(&mut trainer, 0);
+    twin.reset(ResetRequest::Seed(3));
+    let frames = |twin: &Player, envs: &[usize]| -> Vec<u8> {
+        envs.iter().flat_map(|env| twin.batch().observation().chunks(84 * 84 * 3).nth(*env).unwrap()).copied().collect()
+    };
+    for number in 2..7 {
+        let features = step(&mut trainer, 0).batch().features().to_vec();
+        twin.step_all(1);
+        // The trainer pauses. The picture may follow after the numbers.
+        for (socket, envs) in sockets.iter_mut().zip([&[5, 2][..], &[0]]) {
+            let expected = frames(&twin, envs);
+            let start = Instant::now();
+            let about = loop {
+                let (about, pixels) = socket.wait(|about| about["batch"]["step"] == number);
+                if pixels == expected {
+                    break about;
+                }
+                assert!(start.elapsed() < TIMEOUT, "{envs:?} at step {number}");
+            };
+            assert_eq!(about["batch"]["frame"]["width"], 84);
+            let width = features.len() / 6;
+            assert_eq!(about["batch"]["envs"][0]["features"], json!(features[envs[0] * width..][..width]));
+        }
+    }
+    // Another environment, while the trainer pauses.
+    sockets[1].select(0, &[3, 4]);
+    let (_, pixels) =
+        sockets[1].wait(|about| about["batch"]["frame"]["width"] == 84 && about["batch"]["envs"][1]["env"] == 4);
+    assert!(pixels == frames(&twin, &[3, 4]));
 }
 
 #[test]

@@ -46,6 +46,7 @@
 //! | an observer resumes while the trainer pauses | the idle engine sends the last batch of the group again, with the same header; the trainer skips it, since it answers no pending request, and no observer returns a step twice |
 //! | an observer holds batches | their memory in the engine's segment was reserved when it connected (otherwise it is refused); that of engine and trainer, when the engine started |
 //! | a request names another incarnation | the engine ignores it |
+//! | a process wants to see environments whose batches have no frames | it creates a file in shared memory, `/dev/shm/PREFIXINCARNATION.NUMBER.picture`, with their numbers ([`Pictures`]); the engine draws them into it at most ten times per second, until the process ends |
 //! | a process asks what an engine is doing | it reads the engine's [`EngineStatus`] from a file in shared memory, which affects no other process |
 //! | an engine dies and a new one takes its name | the old specification is removed under the namespace's lock, so that the new one's is never removed |
 //!
@@ -114,6 +115,7 @@ mod protocol {
     pub(crate) mod discovery;
     pub(crate) mod limits;
     pub(crate) mod message;
+    pub(crate) mod picture_file;
     pub(crate) mod ports;
     pub(crate) mod specification;
     pub(crate) mod status_file;
@@ -124,6 +126,7 @@ mod engine {
     pub(crate) mod checkpoint;
     pub(crate) mod config;
     pub(crate) mod group;
+    pub(crate) mod pictures;
     pub(crate) mod serving;
     pub(crate) mod status_writer;
 }
@@ -134,6 +137,7 @@ mod client {
     pub(crate) mod connection;
     pub(crate) mod lease;
     pub(crate) mod observer;
+    pub(crate) mod pictures;
     pub(crate) mod requests;
     pub(crate) mod status;
     pub(crate) mod trainer;
@@ -142,6 +146,7 @@ mod client {
 pub use client::connect::{ConnectConfig, timeout_from_seconds};
 pub use client::lease::BatchLease;
 pub use client::observer::{Observed, Observer, Observers};
+pub use client::pictures::{Drawn, Pictures};
 pub use client::requests::{GroupReconnection, LastRequest, Reconnection};
 pub use client::status::{EngineProcesses, EngineStatus, GroupStatus, ObserverStatus};
 pub use client::trainer::Trainer;

@@ -122,13 +122,15 @@ class View {
     if (about.status && about.status.uptime_seconds !== this.status.uptime_seconds) this.#read(about.status);
     if (!about.batch || about.batch.group !== this.group || about.batch.envs.length === 0) return;
     this.frames += 1;
-    const { frame, envs } = about.batch;
-    $("no-frames").hidden = Boolean(frame);
-    $("views").hidden = !frame;
-    $("rows").hidden = Boolean(frame);
-    this.newest = frame ? { frame, envs, pixels } : null;
-    if (frame) this.#paint(this.newest);
-    else this.#rows(about.batch);
+    const { frame, envs, features } = about.batch;
+    $("no-frames").hidden = about.has_frames;
+    $("views").hidden = !about.has_frames;
+    $("rows").hidden = features.length === 0;
+    if (features.length > 0) this.#rows(about.batch);
+    if (frame) {
+      this.newest = { frame, envs, pixels };
+      this.#paint(this.newest);
+    } else $("nothing").textContent = "The engine has not drawn these environments yet.";
   }
 
   #state(state, text) {

@@ -1,11 +1,11 @@
 //! A message to a browser: an engine's state as JSON, and the pixels of the environments that the browser shows.
 //!
 //! It consists of the length of the JSON text as a little-endian `u32`, the text, and the newest frame of each
-//! environment as stored in the batch.
+//! environment, as stored in the batch or as the engine has drawn it.
 
 use endless_gym_core::batch::{Batch, BatchSection, Frames, Section};
 use endless_gym_core::raster::FrameShape;
-use endless_gym_service::{BatchLease, ServiceSpecification};
+use endless_gym_service::{BatchLease, Drawn, ServiceSpecification};
 use serde::Deserialize;
 use serde_json::{Value as Json, json};
 
@@ -30,7 +30,7 @@ impl Default for Selection {
 
 impl Selection {
     /// The environments of the selection that the engine has.
-    fn existing(&self, num_envs: usize) -> Vec<usize> {
+    pub fn existing(&self, num_envs: usize) -> Vec<usize> {
         self.envs.iter().copied().filter(|env| *env < num_envs).take(MAX_SHOWN).collect()
     }
 }
@@ -44,22 +44,30 @@ fn describe(frames: Frames, FrameShape { width, height, channels }: FrameShape) 
     json!({"width": width, "height": height, "channels": channels, "x": x, "y": y, "channel": channel, "stack": frames.stack})
 }
 
-/// The message with `about` as its JSON, and the selected environments' data from a batch.
+/// The message with `about` as its JSON, and the selected environments' data from a batch. `drawn` is for batches without
+/// frames.
 pub(crate) fn encode(
     mut about: Json,
     specification: Option<&ServiceSpecification>,
     selection: &Selection,
     lease: Option<&BatchLease>,
+    drawn: Option<&Drawn>,
 ) -> Vec<u8> {
     let mut pixels = Vec::<&[u8]>::new();
     if let (Some(specification), Some(lease)) = (specification, lease) {
-        let (batch, envs) = (lease.batch(), selection.existing(specification.num_envs));
+        let (batch, mut envs) = (lease.batch(), selection.existing(specification.num_envs));
+        let drawn = drawn.filter(|drawn| drawn.group == lease.group() && envs.starts_with(&drawn.envs));
+        // If the frames are large, the engine draws only the first of them.
+        envs.truncate(drawn.map_or(envs.len(), |drawn| drawn.envs.len()));
         about["batch"] = rows(specification, &batch, &envs);
         about["batch"]["step"] = json!(lease.step());
         about["batch"]["group"] = json!(lease.group());
         if let Some((frames, shape)) = specification.frames.zip(specification.frame) {
             about["batch"]["frame"] = describe(frames, shape);
             pixels = newest_frames(specification, frames, &batch, &envs);
+        } else if let Some(drawn) = drawn {
+            about["batch"]["frame"] = describe(Frames::default(), drawn.shape);
+            pixels.push(&drawn.frames);
         }
     }
     let text = about.to_string();

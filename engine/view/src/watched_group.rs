@@ -123,6 +123,10 @@ impl WatchedGroup {
         self.is_busy && !self.observer.is_paused()
     }
 
+    pub fn observer(&self) -> &Observer {
+        &self.observer
+    }
+
     /// The newest batch, if it is held.
     pub fn newest(&self) -> Option<&BatchLease> {
         self.newest.as_ref()

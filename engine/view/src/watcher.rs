@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{ConnectConfig, EngineStatus, Observer, ServiceError, ServiceSpecification};
+use endless_gym_service::{ConnectConfig, EngineStatus, Observer, Pictures, ServiceError, ServiceSpecification};
 use serde_json::{Value as Json, json};
 
 use crate::channel::{Channel, Viewer};
@@ -53,7 +53,7 @@ pub(crate) fn run(channel: &Channel) {
                 return;
             }
             for viewer in viewers.iter().filter(|viewer| viewer.wants(is_news)) {
-                viewer.give(|selection| message::encode(state.about(channel), None, selection, None));
+                viewer.give(|selection| message::encode(state.about(channel), None, selection, None, None));
             }
             is_news = false;
             thread::sleep(INTERVAL);
@@ -88,6 +88,8 @@ impl State {
 /// A connection to one run of the engine.
 struct Observation {
     specification: Arc<ServiceSpecification>,
+    /// What the engine draws for the browsers, if its batches have no frames.
+    pictures: Vec<(Arc<Viewer>, Pictures)>,
     groups: Vec<WatchedGroup>,
     status: Json,
     details: Details,
@@ -108,7 +110,7 @@ impl Observation {
             groups.push(WatchedGroup::new(observer));
         }
         channel.history().begin(specification.incarnation);
-        Ok(Observation { specification, groups, status: Json::Null, details: Details::default() })
+        Ok(Observation { specification, pictures: Vec::new(), groups, status: Json::Null, details: Details::default() })
     }
 
     /// Observes until the last browser has left or the engine is lost.
@@ -145,6 +147,7 @@ impl Observation {
             if self.take(channel)? {
                 (is_news, heard) = (true, Instant::now());
             }
+            self.look(&viewers);
             if heard.elapsed() >= LIVENESS_INTERVAL {
                 self.check_alive()?;
                 heard = Instant::now();
@@ -166,6 +169,36 @@ impl Observation {
             }
         }
         Ok(is_new)
+    }
+
+    /// Asks the engine to draw what the browsers show, if its batches have no frames, and reads what it has drawn.
+    fn look(&mut self, viewers: &[Arc<Viewer>]) {
+        let is_shown =
+            |viewer: &Arc<Viewer>| !viewer.is_hidden() && viewers.iter().any(|other| Arc::ptr_eq(other, viewer));
+        self.pictures.retain(|(viewer, _)| is_shown(viewer));
+        for viewer in viewers.iter().filter(|viewer| !viewer.is_hidden()) {
+            if self.specification.frames.is_some() || self.drawn_for(viewer).is_some() {
+                continue;
+            }
+            match Pictures::of(self.groups[0].observer()) {
+                Ok(pictures) => self.pictures.extend(pictures.map(|pictures| (Arc::clone(viewer), pictures))),
+                Err(error) => tracing::debug!(%error, "the engine is not asked for pictures"),
+            }
+        }
+        for (viewer, pictures) in &mut self.pictures {
+            let selection = viewer.selection();
+            if let Err(error) = pictures.want(selection.group, &selection.existing(self.specification.num_envs)) {
+                tracing::debug!(%error, "the engine is not asked for other pictures");
+            }
+            let has_batch = self.groups.get(selection.group).is_some_and(|group| group.newest().is_some());
+            if pictures.refresh() && has_batch {
+                viewer.wants(true);
+            }
+        }
+    }
+
+    fn drawn_for(&self, viewer: &Arc<Viewer>) -> Option<&Pictures> {
+        self.pictures.iter().find(|(other, _)| Arc::ptr_eq(other, viewer)).map(|(_, pictures)| pictures)
     }
 
     /// An error if the engine has ended.
@@ -194,10 +227,12 @@ impl Observation {
                     "id": self.specification.id,
                     "groups": self.specification.groups,
                     "num_envs": self.specification.num_envs,
+                    "has_frames": !self.specification.environment["frame"].is_null(),
                     "status": self.status,
                 });
                 let lease = self.groups.get(selection.group).and_then(WatchedGroup::newest);
-                message::encode(about, Some(&self.specification), selection, lease)
+                let drawn = self.drawn_for(viewer).and_then(Pictures::newest);
+                message::encode(about, Some(&self.specification), selection, lease, drawn)
             });
         }
     }

@@ -346,6 +346,29 @@ impl Pool {
         Ok(self.envs.progress(env))
     }
 
+    /// The frame that one environment's observation shows, in the default format, whether or not batches contain frames. Draws it
+    /// in full and changes nothing.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NotReset`], [`PoolError::NoSuchEnv`] or [`PoolError::NoFrame`].
+    ///
+    /// ```
+    /// # use endless_gym_core::batch::zeroed;
+    /// # use endless_gym_memory_gym::memory_gym;
+    /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    /// let config = PoolConfig { features: true, frames: None, ..PoolConfig::new("MysteryPath-v0", 2) };
+    /// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
+    /// pool.reset(ResetRequest::Seed(3), &mut zeroed(pool.layout().blocks()))?;
+    /// assert_eq!(pool.frame(1)?.len(), 84 * 84 * 3);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn frame(&self, env: usize) -> Result<Vec<u8>, PoolError> {
+        self.check_running(env)?;
+        self.spec().frame.ok_or(PoolError::NoFrame { id: self.spec().id })?;
+        Ok(self.envs.frame(env, FrameFormat::new(self.spec(), None)))
+    }
+
     /// The ground-truth view of one environment, with what is hidden from the agent, at 4 times the width and height of the frame.
     ///
     /// # Errors

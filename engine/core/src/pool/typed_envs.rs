@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use super::autoreset::Autoreset;
 use super::config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 use super::division::EnvRange;
-use super::drawn_scene::{DrawSettings, DrawnScene, FrameFormat, WrongFrame};
+use super::drawn_scene::{DrawSettings, DrawnScene, FrameFormat, WrongFrame, draw_in_full};
 use super::env_slot::{EnvSlot, OptionSet};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
@@ -73,6 +73,9 @@ pub(super) trait AnyEnvs: Send + Sync {
 
     /// Progress of one environment's episode.
     fn progress(&self, env: usize) -> Vec<Progress>;
+
+    /// Draws one environment's newest frame in full.
+    fn frame(&self, env: usize, format: FrameFormat) -> Vec<u8>;
 
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, shape: FrameShape) -> Picture;
@@ -304,6 +307,12 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
 
     fn progress(&self, env: usize) -> Vec<Progress> {
         self.slots[env].env.progress()
+    }
+
+    fn frame(&self, env: usize, format: FrameFormat) -> Vec<u8> {
+        let (env, mut frame) = (&self.slots[env].env, vec![0; format.bytes()]);
+        draw_in_full::<E>(env.shared(), &env.scene(), format, &mut frame);
+        frame
     }
 
     fn ground_truth_view(&mut self, env: usize, shape: FrameShape) -> Picture {

@@ -111,6 +111,10 @@ impl Observer {
         &self.specification
     }
 
+    pub(crate) fn node(&self) -> &NamespaceNode {
+        &self.node
+    }
+
     /// The newest batch, or `None` if there has been none since the last call.
     ///
     /// # Errors

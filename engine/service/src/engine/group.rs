@@ -136,6 +136,11 @@ impl Group {
         }
     }
 
+    /// An environment's frame in the default format; `None` if there is none.
+    pub(crate) fn frame(&self, env: usize) -> Option<Vec<u8>> {
+        self.pool.frame(env).ok()
+    }
+
     /// The next request, if there is one.
     pub(crate) fn poll(&self) -> Result<Option<RequestSample>, ServiceError> {
         match self.requests.receive() {

@@ -12,6 +12,7 @@ use serde_json::json;
 use crate::engine::checkpoint::{CheckpointHead, Checkpointer};
 use crate::engine::config::EngineConfig;
 use crate::engine::group::{Group, Outcome, Rejected, RequestSample};
+use crate::engine::pictures::{self, PictureDrawer};
 use crate::engine::status_writer::{EngineSummary, StatusWriter};
 use crate::error::{CheckpointError, PACKAGE_VERSION, Rejection, ServiceError};
 use crate::namespace::descriptors;
@@ -33,7 +34,7 @@ const CLEANUP_INTERVAL: Duration = Duration::from_millis(500);
 /// How long a stopping engine waits for its trainer to end as well.
 const LAST_CLEANUP: Duration = Duration::from_millis(100);
 
-/// How often an engine checks that it can still be found.
+/// How often an engine checks that it can still be found, and looks for viewers.
 const CHECK_INTERVAL: Duration = Duration::from_millis(500);
 
 /// How often an engine refreshes the times of the namespace's files.
@@ -94,6 +95,8 @@ pub struct Engine {
     to_engine: Listener<Ipc>,
     specification: ServiceSpecification,
     checkpointer: Option<Checkpointer>,
+    /// `None` if batches have frames, or the environments have none.
+    pictures: Option<PictureDrawer>,
     node: NamespaceNode,
 }
 
@@ -142,7 +145,7 @@ impl Engine {
         let limits = specification.lease_limits();
         let blocks = chunk_blocks(&specification.batch);
         PrefaultedChunks::check_available(blocks, limits.trainer_chunks() * config.groups)?;
-        descriptors::reserve(descriptors::of_engine(config.groups, config.observers))?;
+        descriptors::reserve(descriptors::of_engine(config.groups, config.observers) + pictures::MAX_VIEWERS)?;
         let names = ServiceNames::new(&config.service, specification.incarnation);
         let services = EngineServices { node: &node, names, mode: OpenMode::Create };
         let creating = node.creating()?;
@@ -168,7 +171,9 @@ impl Engine {
         Self::check_published(&node, &specification)?;
         let (service, process) = (&*specification.service, specification.engine_pid);
         tracing::info!(service, process, id = &*specification.id, groups = specification.groups, "engine started");
-        Ok(Engine { groups, to_trainer, to_engine, specification, status, checkpointer, node })
+        let draws = specification.frames.is_none() && !specification.environment["frame"].is_null();
+        let pictures = draws.then(|| PictureDrawer::new(node.prefix(), specification.incarnation));
+        Ok(Engine { groups, to_trainer, to_engine, specification, status, checkpointer, pictures, node })
     }
 
     /// Fails unless a trainer could find the engine and all of its services.
@@ -214,6 +219,7 @@ impl Engine {
             if last_check.elapsed() >= CHECK_INTERVAL {
                 self.node.check_root()?;
                 last_check = Instant::now();
+                self.pictures.as_mut().map(PictureDrawer::find_viewers);
                 if last_refresh.elapsed() >= REFRESH_INTERVAL {
                     self.node.refresh_files();
                     last_refresh = last_check;
@@ -249,6 +255,9 @@ impl Engine {
             }
             if is_idle {
                 self.groups.iter_mut().for_each(Group::repeat_batch);
+            }
+            if let Some(pictures) = &mut self.pictures {
+                pictures.draw(&self.groups, &self.status);
             }
             if let Some(checkpointer) = &mut self.checkpointer {
                 checkpointer.poll(&self.groups, &mut self.status);

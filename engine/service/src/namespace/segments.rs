@@ -1,4 +1,4 @@
-//! The files in `/dev/shm`: shared memory segments, and the status files of engines and observers.
+//! The files in `/dev/shm`: shared memory segments, the status files of engines and observers, and the files of viewers.
 
 use std::fs::{self, File};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
@@ -8,9 +8,10 @@ use rustix::fs::{FlockOperation, OFlags, flock};
 
 pub(crate) const DIRECTORY: &str = "/dev/shm";
 
-/// Suffixes of the status files of engines and of observers.
+/// Suffixes of the status files of engines and of observers, and of the files of viewers.
 pub(crate) const STATUS_SUFFIX: &str = ".status";
 pub(crate) const OBSERVER_SUFFIX: &str = ".observer";
+pub(crate) const PICTURE_SUFFIX: &str = ".picture";
 
 /// The path of a file.
 pub(crate) fn path(name: &str) -> PathBuf {
@@ -27,27 +28,32 @@ pub(crate) fn named(prefix: &str, suffix: &str) -> Vec<PathBuf> {
 
 /// Opens a status file of this user for reading.
 pub(crate) fn open_status(path: &Path) -> Option<File> {
+    open_own(path, false)
+}
+
+/// Opens a file of this user for reading, and perhaps for writing.
+pub(crate) fn open_own(path: &Path, write: bool) -> Option<File> {
     let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
-    let file = File::options().read(true).custom_flags(flags.cast_signed()).open(path).ok()?;
+    let file = File::options().read(true).write(write).custom_flags(flags.cast_signed()).open(path).ok()?;
     let metadata = file.metadata().ok()?;
     (metadata.is_file() && metadata.uid() == rustix::process::getuid().as_raw()).then_some(file)
 }
 
-/// Whether the process that writes a status file is running: it holds an exclusive lock on the file.
-pub(crate) fn has_writer(status: &File) -> bool {
+/// Whether the process that created a status file or a viewer's file is running: it holds an exclusive lock on the file.
+pub(crate) fn has_writer(file: &File) -> bool {
     // A shared lock: with an exclusive one, others would take this process for the writer.
-    let is_locked = flock(status, FlockOperation::NonBlockingLockShared).is_err();
+    let is_locked = flock(file, FlockOperation::NonBlockingLockShared).is_err();
     if !is_locked {
-        let _ = flock(status, FlockOperation::Unlock);
+        let _ = flock(file, FlockOperation::Unlock);
     }
     is_locked
 }
 
-/// Removes the status files of dead engines and observers.
+/// Removes the files of dead engines, observers and viewers.
 pub(crate) fn remove_abandoned_status(prefix: &str) {
-    for path in named(prefix, STATUS_SUFFIX).into_iter().chain(named(prefix, OBSERVER_SUFFIX)) {
+    for path in [STATUS_SUFFIX, OBSERVER_SUFFIX, PICTURE_SUFFIX].into_iter().flat_map(|suffix| named(prefix, suffix)) {
         if open_status(&path).is_some_and(|file| !has_writer(&file)) {
-            tracing::debug!(path = %path.display(), "removing the status of a dead process");
+            tracing::debug!(path = %path.display(), "removing the file of a dead process");
             // An error means that another process has removed it.
             let _ = fs::remove_file(&path);
         }
