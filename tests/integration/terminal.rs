@@ -261,7 +261,14 @@ fn a_missing_terminal_and_invalid_arguments_are_errors() {
 fn a_training_is_viewed_until_the_engine_ends() {
     let place = Place::new();
     let id = "SearingSpotlights-v0";
-    let mut engine = place.serve(&["--env", id, "--num-envs", "1", "--seed", "5"]);
+    for observation in [&["--no-frames", "--features"][..], &[]] {
+        views_until_the_engine_ends(&place, id, observation);
+    }
+}
+
+fn views_until_the_engine_ends(place: &Place, id: &str, observation: &[&str]) {
+    let arguments = [&["--env", id, "--num-envs", "1", "--seed", "5"], observation].concat();
+    let mut engine = place.serve(&arguments);
     let mut trainer = place.trainer("endless").unwrap();
     let mut session = Session::start(&mut place.endless(&["view", "--terminal", "--timeout", "20"]));
     session.wait_for("no trainer has stepped");

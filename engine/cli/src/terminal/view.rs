@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::Frames;
 use endless_gym_core::raster::FrameShape;
-use endless_gym_service::{Observed, ServiceError};
+use endless_gym_service::{Observed, Pictures, ServiceError};
 use endless_gym_view::RecentRate;
 use ratatui::Frame;
 use ratatui::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers};
@@ -53,7 +53,10 @@ pub struct TerminalArgs {
 
 /// The environments that are shown, by group and number.
 struct Wall {
+    /// `None` if the environments have no frames.
     frames: Option<(Frames, FrameShape)>,
+    /// By group, what the engine draws if its batches have no frames.
+    drawn: BTreeMap<usize, Pictures>,
     num_envs: usize,
     groups: usize,
     /// By group, when it was last seen and its first environments.
@@ -67,12 +70,26 @@ impl Wall {
     fn add(&mut self, observed: &Observed) {
         let group = observed.lease.group();
         let is_recent = self.seen.get(&group).is_some_and(|(time, _)| time.elapsed() < INTERVAL);
-        let Some((frames, shape)) = self.frames.filter(|_| !is_recent) else { return };
+        let Some((frames, shape)) = self.frames.filter(|_| !is_recent && self.drawn.is_empty()) else { return };
         let bytes: usize = frames.shape(shape).iter().product();
         let batch = observed.lease.batch();
         let pictures =
             batch.observation().chunks_exact(bytes).take(self.places).map(|rows| newest(rows, frames, shape));
         self.seen.insert(group, (Instant::now(), pictures.collect()));
+    }
+
+    /// Stores what the engine has drawn, and asks it for as many environments as fit.
+    fn refresh(&mut self) -> Result<(), ServiceError> {
+        let wanted: Vec<_> = (0..self.num_envs.min(self.places)).collect();
+        for (group, pictures) in &mut self.drawn {
+            pictures.want(*group, &wanted)?;
+            if let (true, Some(drawn)) = (pictures.refresh(), pictures.newest()) {
+                let frames = drawn.frames.chunks_exact(drawn.shape.bytes());
+                let shown = frames.map(|frame| newest(frame, Frames::default(), drawn.shape)).collect();
+                self.seen.insert(*group, (Instant::now(), shown));
+            }
+        }
+        Ok(())
     }
 
     /// Side of a picture in its own size.
@@ -129,11 +146,17 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     let stop = stop::on_signal()?;
     let Some(mut observers) = connect(service, args.group, timeout, stop)? else { return Ok(()) };
     let specification = observers.specification().clone();
-    let groups = args.group.map_or(specification.groups, |_| 1);
+    let groups = args.group.map_or(0..specification.groups, |group| group..group + 1);
+    let mut drawn = BTreeMap::new();
+    for group in groups.clone() {
+        drawn.extend(observers.pictures()?.map(|pictures| (group, pictures)));
+    }
+    let shape = drawn.values().next().map(|pictures| (Frames::default(), pictures.shape()));
     let mut wall = Wall {
-        frames: specification.frames.zip(specification.frame),
+        frames: specification.frames.zip(specification.frame).or(shape),
+        drawn,
         num_envs: specification.num_envs,
-        groups,
+        groups: groups.len(),
         seen: BTreeMap::new(),
         places: specification.num_envs,
     };
@@ -161,6 +184,7 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
         }
         if drawn.is_none_or(|time| time.elapsed() >= INTERVAL) {
             drawn = Some(Instant::now());
+            wall.refresh()?;
             let lines = lines(&title, &statistics, if has_ended { 0.0 } else { rate }, has_ended);
             screen.draw(|frame| draw(frame, &mut wall, lines))?;
         }
@@ -200,7 +224,7 @@ fn draw(frame: &mut Frame<'_>, wall: &mut Wall, [first, last]: [String; 2]) {
     let total = wall.num_envs * wall.groups;
     let lines = |wall: &Wall, shown: usize| {
         let middle = match wall.frames {
-            None => "the engine draws no frames (--no-frames)".to_owned(),
+            None => "these environments have no frames".to_owned(),
             Some(_) if wall.seen.is_empty() => "no trainer has stepped the engine since".to_owned(),
             Some(_) => format!("{shown} of {total} environments are shown"),
         };
@@ -228,6 +252,7 @@ mod tests {
         let pictures = |group| (0..count).map(|env| picture(group, env)).collect();
         Wall {
             frames: Some((Frames::default(), FRAME)),
+            drawn: BTreeMap::new(),
             num_envs: count.into(),
             groups,
             seen: (0..groups).map(|group| (group, (Instant::now(), pictures(group)))).collect(),

@@ -13,6 +13,7 @@ use rustix::io::Errno;
 
 use crate::client::connect::{ConnectConfig, connect_to_engine};
 use crate::client::lease::{BatchLease, Response, ResponsePort, ResponseService};
+use crate::client::pictures::Pictures;
 use crate::client::status;
 use crate::error::ServiceError;
 use crate::namespace::node::NamespaceNode;
@@ -298,6 +299,15 @@ impl Observers {
     /// The engine's specification.
     pub fn specification(&self) -> &ServiceSpecification {
         self.observers[0].specification()
+    }
+
+    /// Asks the engine to draw environments of one of the groups, if its batches have no frames.
+    ///
+    /// # Errors
+    ///
+    /// As [`Pictures::of`].
+    pub fn pictures(&self) -> Result<Option<Pictures>, ServiceError> {
+        Pictures::of(&self.observers[0])
     }
 
     /// The next batch of any of the groups. Waits for it up to `timeout`.

@@ -77,6 +77,11 @@ impl Pictures {
         Ok(Some(Pictures { file, path, process, shape, wanted, sequence: 0, newest: None }))
     }
 
+    /// Size of a frame.
+    pub fn shape(&self) -> FrameShape {
+        self.shape
+    }
+
     /// Asks for other environments of a group, in this order; the first 256 of them, or fewer if their frames have more than 16
     /// MiB. Numbers that do not exist yield no pictures.
     ///
