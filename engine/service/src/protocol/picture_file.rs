@@ -137,14 +137,16 @@ impl PictureFile {
 
     /// The pictures with that sequence number, each of `frame_bytes` bytes; `None` if the engine is writing others.
     pub(crate) fn drawn(&self, sequence: u64, frame_bytes: usize) -> io::Result<Option<(PictureHead, Vec<u8>)>> {
+        if !sequence.is_multiple_of(2) {
+            return Ok(None);
+        }
         fence(Ordering::SeqCst);
         let head: PictureHead = self.read(PICTURES)?;
         let Some(envs) = head.wanted.envs() else { return Ok(None) };
         let mut frames = vec![0; envs.len() * frame_bytes];
         self.0.read_exact_at(&mut frames, PICTURES + size_of::<PictureHead>() as u64)?;
         fence(Ordering::SeqCst);
-        let is_complete = sequence.is_multiple_of(2) && self.sequence()? == sequence;
-        Ok(is_complete.then_some((head, frames)))
+        Ok((self.sequence()? == sequence).then_some((head, frames)))
     }
 
     fn read<T: Pod>(&self, at: u64) -> io::Result<T> {
