@@ -261,7 +261,7 @@ def memories(folder: Path, track: str) -> None:
         places = range(len(summary))
         for axes, title in zip((left, *others), ("interquartile mean", *tasks), strict=True):
             plain(axes)
-            axes.set_title(title, loc="left", fontsize=SMALL, color=theme.faint)
+            axes.set_title(title.replace("-", "\n"), loc="left", fontsize=SMALL, color=theme.faint)
             axes.set(xlim=(-0.1, 1.1), ylim=(len(summary) - 0.4, -0.6))
             axes.set_xticks([0, 1])
             axes.grid(axis="x", lw=1)
@@ -273,10 +273,10 @@ def memories(folder: Path, track: str) -> None:
             left.plot(one["iqm"], place, "o", color=theme.blue, ms=6.5, mec="none")
             for axes, task in zip(others, tasks, strict=True):
                 axes.plot(one["tasks"][task], place, "o", color=theme.grey, ms=5.5, mec="none", clip_on=False)
-        figure.subplots_adjust(0.13, 0.28 / height, 0.985, 1 - 0.95 / height, wspace=0.25)
+        figure.subplots_adjust(0.13, 0.28 / height, 0.985, 1 - 1.05 / height, wspace=0.25)
         note = (
             f"0: without memory, 1: scripted expert. {summary[0]['seeds']} seeds for each task; bars: 95 % intervals."
         )
         header(figure, theme, "Memories", note)
 
-    chart(folder, track, 0.26 * len(summary) + 1.3, draw)
+    chart(folder, track, 0.26 * len(summary) + 1.4, draw)
