@@ -18,6 +18,7 @@ PAGES = {
     "design/comparison.md": "benches/comparison.md",
     "reference/changes.md": "CHANGELOG.md",
     "train/learning.md": "agents/benches/learning/README.md",
+    "train/leaderboard.md": "agents/benches/leaderboard/laptop.md",
 }
 
 #: The folder of the built page that plays; none if it is not part of the site.

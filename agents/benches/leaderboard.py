@@ -174,7 +174,8 @@ def table(track: dict[str, Any], rows: list[dict[str, Any]]) -> str:
     for one in found:
         shown = ["", "incomplete"]
         if "iqm" in one:
-            shown = [f"{one['iqm']:.2f}", f"{one['low']:.2f} to {one['high']:.2f}"]
+            interval = f"{one['low']:.2f} to {one['high']:.2f}" if one["seeds"] > 1 else "one seed"
+            shown = [f"{one['iqm']:.2f}", interval]
         cells = [f"{one['tasks'][task]:.2f}" if task in one["tasks"] else "" for task in tasks]
         numbers = [f"{one[key]:,.0f}" for key in ("parameters", "acting", "learning", "state_bytes")]
         lines.append(" | ".join([f"| `{one['agent']}`", one["size"], *shown, *cells, *numbers]) + " |")
