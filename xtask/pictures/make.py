@@ -22,8 +22,7 @@ def main() -> None:
     charts.comparison(IMAGES, ROOT / "benches/comparison.md")
     charts.learning(IMAGES, LEARNING / "three-commands.json")
     charts.tasks(LEARNING)
-    if (LEADERBOARD / "laptop.results.json").exists():
-        charts.memories(LEADERBOARD, "laptop")
+    charts.memories(LEADERBOARD, "laptop")
     films.overview(IMAGES / "environments.webp")
     for scene in films.SCENES:
         films.environment(IMAGES / "environments" / f"{scene.id}.webp", scene)

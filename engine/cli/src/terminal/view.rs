@@ -56,7 +56,7 @@ struct Wall {
     /// `None` if the environments have no frames.
     frames: Option<(Frames, FrameShape)>,
     /// By group, what the engine draws if its batches have no frames.
-    drawn: BTreeMap<usize, Pictures>,
+    pictures: BTreeMap<usize, Pictures>,
     num_envs: usize,
     groups: usize,
     /// By group, when it was last seen and its first environments.
@@ -70,7 +70,7 @@ impl Wall {
     fn add(&mut self, observed: &Observed) {
         let group = observed.lease.group();
         let is_recent = self.seen.get(&group).is_some_and(|(time, _)| time.elapsed() < INTERVAL);
-        let Some((frames, shape)) = self.frames.filter(|_| !is_recent && self.drawn.is_empty()) else { return };
+        let Some((frames, shape)) = self.frames.filter(|_| !is_recent && self.pictures.is_empty()) else { return };
         let bytes: usize = frames.shape(shape).iter().product();
         let batch = observed.lease.batch();
         let pictures =
@@ -81,7 +81,7 @@ impl Wall {
     /// Stores what the engine has drawn, and asks it for as many environments as fit.
     fn refresh(&mut self) -> Result<(), ServiceError> {
         let wanted: Vec<_> = (0..self.num_envs.min(self.places)).collect();
-        for (group, pictures) in &mut self.drawn {
+        for (group, pictures) in &mut self.pictures {
             pictures.want(*group, &wanted)?;
             if let (true, Some(drawn)) = (pictures.refresh(), pictures.newest()) {
                 let frames = drawn.frames.chunks_exact(drawn.shape.bytes());
@@ -147,14 +147,14 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     let Some(mut observers) = connect(service, args.group, timeout, stop)? else { return Ok(()) };
     let specification = observers.specification().clone();
     let groups = args.group.map_or(0..specification.groups, |group| group..group + 1);
-    let mut drawn = BTreeMap::new();
+    let mut pictures = BTreeMap::new();
     for group in groups.clone() {
-        drawn.extend(observers.pictures()?.map(|pictures| (group, pictures)));
+        pictures.extend(observers.pictures()?.map(|pictures| (group, pictures)));
     }
-    let shape = drawn.values().next().map(|pictures| (Frames::default(), pictures.shape()));
+    let shape = pictures.values().next().map(|pictures| (Frames::default(), pictures.shape()));
     let mut wall = Wall {
         frames: specification.frames.zip(specification.frame).or(shape),
-        drawn,
+        pictures,
         num_envs: specification.num_envs,
         groups: groups.len(),
         seen: BTreeMap::new(),
@@ -252,7 +252,7 @@ mod tests {
         let pictures = |group| (0..count).map(|env| picture(group, env)).collect();
         Wall {
             frames: Some((Frames::default(), FRAME)),
-            drawn: BTreeMap::new(),
+            pictures: BTreeMap::new(),
             num_envs: count.into(),
             groups,
             seen: (0..groups).map(|group| (group, (Instant::now(), pictures(group)))).collect(),

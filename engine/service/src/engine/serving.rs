@@ -219,7 +219,9 @@ impl Engine {
             if last_check.elapsed() >= CHECK_INTERVAL {
                 self.node.check_root()?;
                 last_check = Instant::now();
-                self.pictures.as_mut().map(PictureDrawer::find_viewers);
+                if let Some(pictures) = &mut self.pictures {
+                    pictures.find_viewers();
+                }
                 if last_refresh.elapsed() >= REFRESH_INTERVAL {
                     self.node.refresh_files();
                     last_refresh = last_check;

@@ -5,7 +5,6 @@
 //! use, and missing memory is an error.
 
 use std::mem::MaybeUninit;
-use std::path::Path;
 
 use rustix::io::Errno;
 use rustix::mm::Advice;
@@ -13,6 +12,7 @@ use rustix::mm::Advice;
 use endless_gym_core::batch::BLOCK_BYTES;
 
 use crate::error::ServiceError;
+use crate::namespace::resource_limits;
 use crate::namespace::segments::DIRECTORY;
 
 /// Bytes reserved for iceoryx2's own segments and for headers.
@@ -25,29 +25,10 @@ pub(crate) const NODE_BYTES: u64 = 64 << 10;
 /// raises SIGBUS if there is no memory, and SIGKILL if the control group may not have as much.
 pub(crate) fn check_free(needed: u64) -> Result<(), ServiceError> {
     available().map_or(Ok(()), |available| check(needed, available))?;
-    match control_group_limit() {
+    match resource_limits::control_group() {
         Some(limit) if limit < needed => Err(ServiceError::MemoryLimit { needed, limit }),
         _ => Ok(()),
     }
-}
-
-/// The smallest memory limit of the control groups of this process, in bytes, of version 1 or 2 (cgroups(7)).
-fn control_group_limit() -> Option<u64> {
-    let groups = std::fs::read_to_string("/proc/self/cgroup").ok()?;
-    let limits = groups.lines().filter_map(|line| {
-        let (controllers, group) = line.split_once(':')?.1.split_once(':')?;
-        let (mount, file) = match controllers {
-            "" => ("/sys/fs/cgroup", "memory.max"),
-            "memory" => ("/sys/fs/cgroup/memory", "memory.limit_in_bytes"),
-            _ => return None,
-        };
-        // A group is also limited by those above it. A container may see only its own, as the root.
-        let limit = |group: &Path| {
-            std::fs::read_to_string(format!("{mount}{}/{file}", group.display())).ok()?.trim().parse().ok()
-        };
-        Path::new(group).ancestors().filter_map(limit).min()
-    });
-    limits.min()
 }
 
 /// The addresses of the chunks that have been prefaulted.

@@ -1,4 +1,6 @@
-//! Limits of this process under which iceoryx2 cannot create or map a segment. Its errors do not name them.
+//! Limits of this process under which iceoryx2 cannot create, map or fill a segment. Its errors do not name them.
+
+use std::path::Path;
 
 use rustix::process::{Resource, getrlimit};
 
@@ -21,4 +23,23 @@ pub(crate) fn text() -> Option<String> {
 fn address_space() -> Option<u64> {
     let pages: u64 = std::fs::read_to_string("/proc/self/statm").ok()?.split(' ').next()?.parse().ok()?;
     Some(pages * rustix::param::page_size() as u64)
+}
+
+/// The smallest memory limit of the control groups of this process, in bytes, of version 1 or 2 (cgroups(7)).
+pub(crate) fn control_group() -> Option<u64> {
+    let groups = std::fs::read_to_string("/proc/self/cgroup").ok()?;
+    let limits = groups.lines().filter_map(|line| {
+        let (controllers, group) = line.split_once(':')?.1.split_once(':')?;
+        let (mount, file) = match controllers {
+            "" => ("/sys/fs/cgroup", "memory.max"),
+            "memory" => ("/sys/fs/cgroup/memory", "memory.limit_in_bytes"),
+            _ => return None,
+        };
+        // A group is also limited by those above it. A container may see only its own, as the root.
+        let limit = |group: &Path| {
+            std::fs::read_to_string(format!("{mount}{}/{file}", group.display())).ok()?.trim().parse().ok()
+        };
+        Path::new(group).ancestors().filter_map(limit).min()
+    });
+    limits.min()
 }
