@@ -149,7 +149,7 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     let groups = args.group.map_or(0..specification.groups, |group| group..group + 1);
     let mut pictures = BTreeMap::new();
     for group in groups.clone() {
-        pictures.extend(observers.pictures()?.map(|pictures| (group, pictures)));
+        pictures.extend(Pictures::of(observers.first())?.map(|pictures| (group, pictures)));
     }
     let shape = pictures.values().next().map(|pictures| (Frames::default(), pictures.shape()));
     let mut wall = Wall {

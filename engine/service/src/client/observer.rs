@@ -13,7 +13,6 @@ use rustix::io::Errno;
 
 use crate::client::connect::{ConnectConfig, connect_to_engine};
 use crate::client::lease::{BatchLease, Response, ResponsePort, ResponseService};
-use crate::client::pictures::Pictures;
 use crate::client::status;
 use crate::error::ServiceError;
 use crate::namespace::node::NamespaceNode;
@@ -298,16 +297,12 @@ impl Observers {
 
     /// The engine's specification.
     pub fn specification(&self) -> &ServiceSpecification {
-        self.observers[0].specification()
+        self.first().specification()
     }
 
-    /// Asks the engine to draw environments of one of the groups, if its batches have no frames.
-    ///
-    /// # Errors
-    ///
-    /// As [`Pictures::of`].
-    pub fn pictures(&self) -> Result<Option<Pictures>, ServiceError> {
-        Pictures::of(&self.observers[0])
+    /// The observer of the first of the groups.
+    pub fn first(&self) -> &Observer {
+        &self.observers[0]
     }
 
     /// The next batch of any of the groups. Waits for it up to `timeout`.
