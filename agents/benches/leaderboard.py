@@ -179,6 +179,7 @@ def table(track: dict[str, Any], rows: list[dict[str, Any]]) -> str:
         cells = [f"{one['tasks'][task]:.2f}" if task in one["tasks"] else "" for task in tasks]
         numbers = [f"{one[key]:,.0f}" for key in ("parameters", "acting", "learning", "state_bytes")]
         lines.append(" | ".join([f"| `{one['agent']}`", one["size"], *shown, *cells, *numbers]) + " |")
+    lines += longer_table(tasks, rows, found)
     lines += ["", "| task | measures | expert | `none` | gate |", "| --- | --- | ---: | ---: | --- |"]
     for task in (TASKS[name] for name in tasks):
         score = zero.get(task.name)
@@ -187,6 +188,29 @@ def table(track: dict[str, Any], rows: list[dict[str, Any]]) -> str:
             f"| {task.name} | {task.label} | {task.expert:g} | {'' if score is None else f'{score:.3f}'} | {gate} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def longer_table(tasks: list[str], rows: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[str]:
+    """Mean returns in tasks and in their longer versions; no lines if no task has one."""
+    shown = [(TASKS[name], TASKS[name].longer) for name in tasks]
+    versions = [(task, " ".join(longer[1]) or longer[0]) for task, longer in shown if longer is not None]
+    if not versions:
+        return []
+    lines = [
+        "",
+        "Mean returns in a task, and after the arrow in a longer version of it, in which the agent did not train:",
+        "",
+        "| agent | size | " + " | ".join(f"{task.name} → `{version}`" for task, version in versions) + " |",
+        "| --- | --- |" + " ---: |" * len(versions),
+    ]
+    for one in found:
+        cells = []
+        for task, _ in versions:
+            own = [row for row in rows if all(row[key] == one[key] for key in KEYS[:2]) and row["task"] == task.name]
+            means = [f"{statistics.mean(row[key] for row in own):.2f}" for key in ("score", "longer")] if own else []
+            cells.append(" → ".join(means))
+        lines.append(" | ".join([f"| `{one['agent']}`", one["size"], *cells]) + " |")
+    return lines
 
 
 def main() -> None:

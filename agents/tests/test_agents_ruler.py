@@ -123,7 +123,7 @@ def test_the_interquartile_mean_is_that_of_normalised_scores(leaderboard: Module
     track = {"name": "t", "about": "-", "tasks": ["one-command", "repeat-first"]}
     base = {"parameters": 1, "acting": 1, "learning": 1, "state_bytes": 1}
     rows = [
-        {"agent": agent, "size": "-", "task": task, "seed": seed, "score": score, **base}
+        {"agent": agent, "size": "-", "task": task, "seed": seed, "score": score, "longer": score / 2, **base}
         for agent, scores in {"none": (0.02, -0.5), "gru": (0.1, 1.0)}.items()
         for task, score in zip(track["tasks"], scores, strict=True)
         for seed in (1, 2)
@@ -132,5 +132,6 @@ def test_the_interquartile_mean_is_that_of_normalised_scores(leaderboard: Module
     assert "| `gru` | - | 1.00 | 1.00 to 1.00 | 1.00 | 1.00 |" in page
     assert "| `none` | - | 0.00 | 0.00 to 0.00 | 0.00 | 0.00 |" in page
     assert "| repeat-first | object | 1 | -0.500 | passed |" in page
+    assert "| `gru` | - | 0.10 → 0.05 | 1.00 → 0.50 |" in page
     # A table with holes has no mean.
     assert "| `gru` | - |  | incomplete | 1.00 |" in leaderboard.table(track, rows[:-1])
