@@ -19,6 +19,7 @@ PAGES = {
     "reference/changes.md": "CHANGELOG.md",
     "train/learning.md": "agents/benches/learning/README.md",
     "train/leaderboard.md": "agents/benches/leaderboard/laptop.md",
+    "train/hour.md": "agents/benches/hour/README.md",
 }
 
 #: The folder of the built page that plays; none if it is not part of the site.

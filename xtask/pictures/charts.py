@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 from matplotlib.transforms import blended_transform_factory
 
+from endless_gym_agents.curves import published
 from endless_gym_agents.palette import AGENTS as AGENT_COLOURS
 
 matplotlib.use("svg")
@@ -248,6 +249,43 @@ def tasks(folder: Path) -> None:
         )
 
     chart(folder, "curves", 1.9 * rows + 0.6, draw)
+
+
+def hour(folder: Path) -> None:
+    """Curves of the runs of `agents/benches/hour.py`, from the files in its folder and into it."""
+    runs = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
+    environments = list(dict.fromkeys(run["env"] for run in runs))
+    columns = 2
+    rows = -(-len(environments) // columns)
+
+    def draw(figure: Figure, theme: Theme) -> None:
+        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for axes in panels[len(environments) :]:
+            axes.set_axis_off()
+        for axes, env in zip(panels, environments, strict=False):
+            own = [run for run in runs if run["env"] == env]
+            plain(axes)
+            axes.set_title(f"{env}, {own[0]['metric'].replace('_', ' ')}", loc="left", fontsize=BODY)
+            axes.tick_params(colors=theme.faint)
+            axes.grid(axis="y", lw=1)
+            # With observation reconstruction where the paper used it.
+            paper = {
+                one.label.removesuffix("_rec"): one for one in published(env, ["gru", "gru_rec", "trxl", "trxl_rec"])
+            }
+            for agent, one in paper.items():
+                axes.axhline(one.scores[:, -1].mean(), color=theme.agents[agent], lw=0.8, ls="--")
+            for run in own:
+                minutes, _, values = np.array(run["curve"]).T
+                axes.plot(minutes, values, color=theme.agents[run["agent"]], lw=1.6)
+            axes.set(xlim=(0, None), ylim=(0, None))
+        for place, agent in enumerate(("gru", "mingru", "trxl")):
+            style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
+            figure.text(0.985 - place * 0.07, 1 - 0.2 / figure.get_figheight(), agent, **style)
+        figure.subplots_adjust(0.06, 0.06, 0.985, 0.86, wspace=0.13, hspace=0.5)
+        note = "Evaluation over minutes of training on one core; dashed: the end of the paper's training, from frames."
+        header(figure, theme, "An hour on one core", note)
+
+    chart(folder, "hour", 1.9 * rows + 0.6, draw)
 
 
 def memories(folder: Path, track: str) -> None:

@@ -2,7 +2,8 @@
 pictures` installs the packages and runs this script.
 
 The animations are episodes of the scripted experts with fixed seeds. The charts show `benches/comparison.md` and the results of
-`agents/benches/learning.py` and `leaderboard.py`; measure or train again to change them. The same versions give the same bytes.
+`agents/benches/learning.py`, `leaderboard.py` and `hour.py`; measure or train again to change them. The same versions give the
+same bytes.
 """
 
 from pathlib import Path
@@ -14,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs/images"
 LEARNING = ROOT / "agents/benches/learning"
 LEADERBOARD = ROOT / "agents/benches/leaderboard"
+HOUR = ROOT / "agents/benches/hour"
 
 
 def main() -> None:
@@ -23,6 +25,7 @@ def main() -> None:
     charts.learning(IMAGES, LEARNING / "three-commands.json")
     charts.tasks(LEARNING)
     charts.memories(LEADERBOARD, "laptop")
+    charts.hour(HOUR)
     films.overview(IMAGES / "environments.webp")
     for scene in films.SCENES:
         films.environment(IMAGES / "environments" / f"{scene.id}.webp", scene)
