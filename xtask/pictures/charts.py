@@ -281,11 +281,12 @@ def hour(folder: Path) -> None:
         for place, agent in enumerate(("gru", "mingru", "trxl")):
             style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
             figure.text(0.985 - place * 0.07, 1 - 0.2 / figure.get_figheight(), agent, **style)
-        figure.subplots_adjust(0.06, 0.06, 0.985, 0.86, wspace=0.13, hspace=0.5)
+        height = figure.get_figheight()
+        figure.subplots_adjust(0.06, 0.3 / height, 0.985, 1 - 0.95 / height, wspace=0.13, hspace=0.5)
         note = "Evaluation over minutes of training on one core; dashed: the end of the paper's training, from frames."
         header(figure, theme, "An hour on one core", note)
 
-    chart(folder, "hour", 1.9 * rows + 0.6, draw)
+    chart(folder, "hour", 1.9 * rows + 0.9, draw)
 
 
 def memories(folder: Path, track: str) -> None:
