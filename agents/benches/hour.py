@@ -14,12 +14,12 @@ import dataclasses
 import json
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from endless_gym.program import program
 from endless_gym_agents import checkpoint
 from endless_gym_agents.curves import published
 from endless_gym_agents.evaluate import evaluate, mean
@@ -27,8 +27,6 @@ from endless_gym_agents.logs import read_progress
 from endless_gym_agents.metrics import metric
 
 FOLDER = Path(__file__).parent / "hour"
-#: The program `endless` of the installed package.
-ENDLESS = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())"]
 #: Flags of all runs: one thread, and 64 environments with rollouts of 128 steps, which are also the length of BPTT.
 FLAGS = (
     "--threads 1 --recurrence.hidden-size 64 --ppo.steps 128 --recurrence.sequence-length 128 --ppo.minibatches 8 "
@@ -52,8 +50,8 @@ TASKS = {
     "searing-spotlights": ("SearingSpotlights-v0", [(15, "")]),
     "endless-mystery-path": ("Endless-MysteryPath-v0", [(60, "")]),
 }
-#: Agents of the paper to compare with, and their names.
-PUBLISHED = {"gru": "GRU", "gru_rec": "GRU", "trxl": "TrXL", "trxl_rec": "TrXL"}
+#: Agents of the paper to compare with; those with observation reconstruction take the place of the others where both exist.
+PUBLISHED = ("gru", "gru_rec", "trxl", "trxl_rec")
 
 
 def stage(folder: Path, env: str, agent: str, minutes: float, flags: str, former: Path | None) -> str:
@@ -63,7 +61,7 @@ def stage(folder: Path, env: str, agent: str, minutes: float, flags: str, former
     command += ["--ppo.decay-updates", f"{minutes * updates:.0f}", "--time-limit", f"{minutes:g}"]
     command += ["--checkpoint-interval", f"{2 * updates}"]
     command += ["--init-from", former.name] if former else []
-    subprocess.run([*ENDLESS, *command, "--run", folder.name], cwd=folder.parent, check=True)
+    subprocess.run([*program(), *command, "--run", folder.name], cwd=folder.parent, check=True)
     return f"endless {shlex.join(command)} --run {folder.name}"
 
 
@@ -96,7 +94,9 @@ def run(task: str, agent: str, scale: float, out: Path) -> dict[str, Any]:
             points.append([round(minutes + time, 2), steps + count, round(value, 4)])
         minutes, steps, former = points[-1][0], points[-1][1], folder
         print(f"{task} {agent} stage {number}: {metric(env)[0]} {points[-1][2]} after {minutes} minutes", flush=True)
-    return {"task": task, "env": env, "agent": agent, "metric": metric(env)[0], "commands": commands, "curve": points}
+    paper = {one.label.removesuffix("_rec"): float(one.scores[:, -1].mean()) for one in published(env, PUBLISHED)}
+    described = {"task": task, "env": env, "agent": agent, "metric": metric(env)[0], "paper": paper}
+    return described | {"commands": commands, "curve": points}
 
 
 def report() -> None:
@@ -107,16 +107,16 @@ def report() -> None:
         "Agents that `endless learn` trained for an hour at the most on one thread, from feature observations, and the",
         "evaluation of their last checkpoint: 50 seeds that training never uses, three episodes each, default reset",
         "parameters. Beside them, the agents of the paper after their whole training, mean of five runs. These learnt from",
-        "frames, which is harder: the comparison says what can be had in an hour, not which agent is better. `hour.py` has",
-        "the stages of each run, and a JSON file in this folder its commands.",
+        "frames, which is harder: the comparison says what can be had in an hour, not which agent is better. Two runs at a",
+        "time shared two cores, at times with tests beside them, which costs steps. A JSON file in this folder has the",
+        "commands of each run.",
         "",
         "| environment | metric | agent | minutes | million steps | result | paper: GRU | paper: TrXL |",
         "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |",
     ]
     for data in (json.loads(file.read_text()) for file in sorted(FOLDER.glob("*.json"))):
         minutes, steps, value = data["curve"][-1]
-        paper = {PUBLISHED[one.label]: one.scores[:, -1].mean() for one in published(data["env"], list(PUBLISHED))}
-        cells = [f"{paper[name]:.2f}" if name in paper else "" for name in ("GRU", "TrXL")]
+        cells = [f"{data['paper'][name]:.2f}" if name in data["paper"] else "" for name in ("gru", "trxl")]
         shown = [f"`{data['agent']}`", f"{minutes:.0f}", f"{steps / 1e6:.0f}", f"{value:.2f}", *cells]
         lines.append("| " + " | ".join([data["env"], data["metric"], *shown]) + " |")
     picture = '<source media="(prefers-color-scheme: dark)" srcset="hour-dark.svg">'

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 from matplotlib.transforms import blended_transform_factory
 
-from endless_gym_agents.curves import published
 from endless_gym_agents.palette import AGENTS as AGENT_COLOURS
 
 matplotlib.use("svg")
@@ -268,12 +267,8 @@ def hour(folder: Path) -> None:
             axes.set_title(f"{env}, {own[0]['metric'].replace('_', ' ')}", loc="left", fontsize=BODY)
             axes.tick_params(colors=theme.faint)
             axes.grid(axis="y", lw=1)
-            # With observation reconstruction where the paper used it.
-            paper = {
-                one.label.removesuffix("_rec"): one for one in published(env, ["gru", "gru_rec", "trxl", "trxl_rec"])
-            }
-            for agent, one in paper.items():
-                axes.axhline(one.scores[:, -1].mean(), color=theme.agents[agent], lw=0.8, ls="--")
+            for agent, score in own[0]["paper"].items():
+                axes.axhline(score, color=theme.agents[agent], lw=0.8, ls="--")
             for run in own:
                 minutes, _, values = np.array(run["curve"]).T
                 axes.plot(minutes, values, color=theme.agents[run["agent"]], lw=1.6)
