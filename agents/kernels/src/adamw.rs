@@ -1,5 +1,7 @@
 //! AdamW (Loshchilov and Hutter, 2019), as `torch.optim.AdamW`, and clipping of the global norm.
 
+use crate::vectors::vectorised;
+
 /// The optimizer of one vector of parameters.
 ///
 /// At update t, with the gradient g, the learning rate a, and all other coefficients as in PyTorch by default:
@@ -51,13 +53,19 @@ impl AdamW {
         let decay = (1.0 - learning_rate * Self::WEIGHT_DECAY) as f32;
         let step = (learning_rate / (1.0 - Self::BETA.0.powi(self.updates))) as f32;
         let root = (1.0 - Self::BETA.1.powi(self.updates)).sqrt() as f32;
-        let (new_mean, new_square) = ((1.0 - Self::BETA.0) as f32, (1.0 - Self::BETA.1) as f32);
-        for (((w, g), m), v) in parameters.iter_mut().zip(gradients).zip(&mut self.mean).zip(&mut self.square) {
-            *m += new_mean * (g - *m);
-            *v = Self::BETA.1 as f32 * *v + new_square * g * g;
-            *w = *w * decay - step * *m / (v.sqrt() / root + Self::EPSILON);
-        }
+        update(parameters, gradients, &mut self.mean, &mut self.square, decay, step, root);
     }
+}
+
+vectorised! {
+fn update(w: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32], decay: f32, step: f32, root: f32) {
+    let (new_mean, new_square) = ((1.0 - AdamW::BETA.0) as f32, (1.0 - AdamW::BETA.1) as f32);
+    for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {
+        *m += new_mean * (g - *m);
+        *v = AdamW::BETA.1 as f32 * *v + new_square * g * g;
+        *w = *w * decay - step * *m / (v.sqrt() / root + AdamW::EPSILON);
+    }
+}
 }
 
 /// Scales gradients so that their Euclidean norm is at most `limit`, as `torch.nn.utils.clip_grad_norm_`. Returns the norm before.

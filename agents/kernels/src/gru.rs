@@ -16,7 +16,7 @@
 //! computed step by step.
 
 use crate::functions::{sigmoid, tanh};
-use crate::matrix::{Matrix, Packed, add_product, add_rows, fill_rows};
+use crate::matrix::{Matrix, Packed, add_product, add_rows, product_plus_row};
 use crate::sequences::{Sequences, parts, parts_mut};
 use crate::vectors::vectorised;
 
@@ -63,8 +63,8 @@ pub fn forward(
             step.copy_state_before(row, state, outputs, &mut saved[4 * width..]);
         }
         let recurrent = &mut workspace.rows[..step.rows.len() * 3 * width];
-        fill_rows(recurrent, bias);
-        add_product(recurrent, Matrix::new(saved, SAVED * width).columns(4 * width..5 * width), weight);
+        let before = Matrix::new(saved, SAVED * width).columns(4 * width..5 * width);
+        product_plus_row(recurrent, bias, before, weight);
         let (saved, recurrent) = (saved.chunks_exact_mut(SAVED * width), recurrent.chunks_exact(3 * width));
         for ((row, saved), recurrent) in step.rows.clone().zip(saved).zip(recurrent) {
             let input = &inputs[row * 3 * width..][..3 * width];

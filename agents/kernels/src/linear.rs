@@ -2,7 +2,8 @@
 //!
 //! Shapes: inputs x (M, I), weight W (O, I), bias b (O,), outputs y (M, O).
 
-use crate::matrix::{Matrix, Packed, add_product, add_rows, fill_rows};
+use crate::matrix::{Matrix, Packed, add_product, add_rows, product, product_plus_row};
+use crate::vectors::vectorised;
 
 /// Computes the outputs.
 ///
@@ -12,8 +13,7 @@ use crate::matrix::{Matrix, Packed, add_product, add_rows, fill_rows};
 ///
 /// The shapes do not fit.
 pub fn forward(x: &[f32], weight: &Packed, bias: &[f32], y: &mut [f32]) {
-    fill_rows(y, bias);
-    add_product(y, Matrix::new(x, weight.rows()), weight);
+    product_plus_row(y, bias, Matrix::new(x, weight.rows()), weight);
 }
 
 /// Computes the gradient of the inputs, and adds those of weight and bias to `grad_weight` and `grad_bias`:
@@ -35,20 +35,23 @@ pub fn backward(
     let (inputs, grad_y) = (grad_weight.len() / outputs, Matrix::new(grad_y, outputs));
     if let Some(grad_x) = grad_x {
         packed.pack(Matrix::new(weight, inputs));
-        grad_x.fill(0.0);
-        add_product(grad_x, grad_y, packed);
+        product(grad_x, grad_y, packed);
     }
     packed.pack(Matrix::new(x, inputs));
     add_product(grad_weight, grad_y.t(), packed);
     add_rows(grad_bias, grad_y.data());
 }
 
+vectorised! {
 /// Replaces negative numbers by 0.
 pub fn relu(y: &mut [f32]) {
     y.iter_mut().for_each(|y| *y = if *y < 0.0 { 0.0 } else { *y });
 }
+}
 
+vectorised! {
 /// Replaces the gradient of the outputs `y` of [`relu`] by that of its inputs: 0 where the output is 0.
 pub fn relu_backward(y: &[f32], grad: &mut [f32]) {
     grad.iter_mut().zip(y).for_each(|(grad, y)| *grad = if *y <= 0.0 { 0.0 } else { *grad });
+}
 }

@@ -1,22 +1,23 @@
 //! Matrix products.
 //!
-//! A product is computed in tiles of 6 x 16 numbers, which fill the vector registers (Goto and van de Geijn, "Anatomy of
-//! high-performance matrix multiplication", 2008). Each number is a sum over the inner dimension from the first term to the last,
-//! with fused multiply-add. It depends neither on the other rows and columns nor on the tiles, so a row of a batch gets the same
-//! bits in every batch.
+//! A product is computed in tiles of 6 x 16 numbers, or 6 x 32 with vectors of 512 bits, which fill the vector registers (Goto and
+//! van de Geijn, "Anatomy of high-performance matrix multiplication", 2008). Each number is a sum over the inner dimension from the
+//! first term to the last, with fused multiply-add. It depends neither on the other rows and columns nor on the tiles, so a row of a
+//! batch gets the same bits in every batch and on every CPU.
 
+use std::array::from_fn;
 use std::ops::Range;
 
 use crate::vectors::vectorised;
 
 /// Rows of a tile.
 const ROWS: usize = 6;
-/// Columns of a tile: two vectors of 256 bits.
+/// Columns of a panel: two vectors of 256 bits, or one of 512.
 const COLUMNS: usize = 16;
-/// Inner dimension of a tile. A panel of the right matrix with so many rows stays in the first cache.
+/// Inner dimension of a tile. Panels of the right matrix with so many rows stay in the first cache.
 const DEPTH: usize = 256;
-/// Tiles above each other that share a panel while it is in the first cache.
-const STACK: usize = 8;
+/// Rows of the tiles that share panels while these are in the first cache.
+const HEIGHT: usize = 8 * ROWS;
 
 /// A view of a matrix in memory.
 #[derive(Clone, Copy)]
@@ -62,11 +63,16 @@ impl<'a> Matrix<'a> {
     }
 }
 
+/// A row of a panel, in one line of the cache.
+#[derive(Clone, Copy, Default)]
+#[repr(align(64))]
+struct Row([f32; COLUMNS]);
+
 /// The right matrix of products, in panels of 16 columns. It keeps its memory when it is packed again.
 #[derive(Default)]
 pub struct Packed {
     /// For each 256 rows of the matrix: its panels, each as 256 rows of 16 numbers. Missing columns are zero.
-    panels: Vec<[f32; COLUMNS]>,
+    panels: Vec<Row>,
     rows: usize,
     columns: usize,
 }
@@ -81,16 +87,16 @@ impl Packed {
     pub fn pack(&mut self, matrix: Matrix) {
         (self.rows, self.columns) = (matrix.rows, matrix.columns);
         self.panels.clear();
-        self.panels.resize(matrix.rows * matrix.columns.div_ceil(COLUMNS), [0.0; COLUMNS]);
+        self.panels.resize(matrix.rows * matrix.columns.div_ceil(COLUMNS), Row::default());
         let mut start = 0;
         for depth in blocks(matrix.rows, DEPTH) {
             for columns in blocks(matrix.columns, COLUMNS) {
                 let panel = &mut self.panels[start..][..depth.len()];
                 start += depth.len();
                 for (to, row) in panel.iter_mut().zip(depth.clone()) {
-                    let to = &mut to[..columns.len()];
+                    let to = &mut to.0[..columns.len()];
                     if matrix.column_stride == 1 {
-                        to.copy_from_slice(&matrix.data[row * matrix.row_stride..][columns.clone()]);
+                        copy::<COLUMNS>(&matrix.data[row * matrix.row_stride..][columns.clone()], to);
                     } else {
                         for (to, column) in to.iter_mut().zip(columns.clone()) {
                             *to = matrix.data[row * matrix.row_stride + column * matrix.column_stride];
@@ -107,95 +113,196 @@ fn blocks(length: usize, size: usize) -> impl Iterator<Item = Range<usize>> {
     (0..length).step_by(size).map(move |start| start..length.min(start + size))
 }
 
+/// What a product is added to.
+#[derive(Clone, Copy)]
+enum Start<'a> {
+    Zeros,
+    /// The same numbers (N,) in each row.
+    Row(&'a [f32]),
+    /// The former result.
+    Result,
+}
+
+/// Computes the product of `left` (M, K) and `right` (K, N), (M, N).
+///
+/// # Panics
+///
+/// The shapes do not fit, or K is 0.
+pub fn product(result: &mut [f32], left: Matrix, right: &Packed) {
+    assert_ne!(right.rows, 0);
+    compute(result, Start::Zeros, left, right);
+}
+
+/// Computes the product of `left` (M, K) and `right` (K, N), with `row` (N,) added to each row, (M, N).
+///
+/// # Panics
+///
+/// The shapes do not fit, or K is 0.
+pub fn product_plus_row(result: &mut [f32], row: &[f32], left: Matrix, right: &Packed) {
+    assert_eq!(row.len(), right.columns);
+    assert_ne!(right.rows, 0);
+    compute(result, Start::Row(row), left, right);
+}
+
 /// Adds the product of `left` (M, K) and `right` (K, N) to `sum` (M, N).
 ///
 /// # Panics
 ///
 /// The shapes do not fit.
 pub fn add_product(sum: &mut [f32], left: Matrix, right: &Packed) {
+    compute(sum, Start::Result, left, right);
+}
+
+fn compute(result: &mut [f32], start: Start, left: Matrix, right: &Packed) {
     assert_eq!(left.columns, right.rows);
-    assert_eq!(sum.len(), left.rows * right.columns);
-    add_tiles(sum, left, right);
+    assert_eq!(result.len(), left.rows * right.columns);
+    compute_blocks(result, start, left, right);
 }
 
 vectorised! {
-fn add_tiles(sum: &mut [f32], left: Matrix, right: &Packed) {
-    let width = right.columns;
-    let mut stack = [[[0.0; ROWS]; DEPTH]; STACK];
-    for depth in blocks(right.rows, DEPTH) {
-        let panels = &right.panels[depth.start * width.div_ceil(COLUMNS)..];
-        for rows in blocks(left.rows, ROWS * STACK) {
-            let tiles = rows.len().div_ceil(ROWS);
-            // Tiles of about the same height: 4 and 4 rows rather than 6 and 2.
-            let tile_rows =
-                |tile: usize| rows.start + tile * rows.len() / tiles..rows.start + (tile + 1) * rows.len() / tiles;
-            pack_tiles(left, depth.clone(), &mut stack[..tiles], tile_rows);
-            for (columns, panel) in blocks(width, COLUMNS).zip(panels.chunks_exact(depth.len())) {
-                for (tile, packed) in stack[..tiles].iter().enumerate() {
-                    let rows = tile_rows(tile);
-                    let sum = &mut sum[rows.start * width + columns.start..];
-                    match rows.len() {
-                        6 => add_tile::<6>(sum, width, columns.len(), packed, panel),
-                        5 => add_tile::<5>(sum, width, columns.len(), packed, panel),
-                        4 => add_tile::<4>(sum, width, columns.len(), packed, panel),
-                        3 => add_tile::<3>(sum, width, columns.len(), packed, panel),
-                        2 => add_tile::<2>(sum, width, columns.len(), packed, panel),
-                        _ => add_tile::<1>(sum, width, columns.len(), packed, panel),
-                    }
-                }
-            }
-        }
+fn compute_blocks(result: &mut [f32], start: Start, left: Matrix, right: &Packed) {
+    if LANES == COLUMNS {
+        compute_blocks_with::<2>(result, start, left, right);
+    } else {
+        compute_blocks_with::<1>(result, start, left, right);
     }
 }
 }
 
-/// Copies rows of some columns to tiles, column by column, in the order in which they are in memory.
+/// Computes a product in tiles that are `P` panels wide, in blocks of rows and of the inner dimension.
 #[inline(always)]
-fn pack_tiles(
-    left: Matrix,
-    columns: Range<usize>,
-    tiles: &mut [[[f32; ROWS]; DEPTH]],
-    rows: impl Fn(usize) -> Range<usize>,
-) {
+fn compute_blocks_with<const P: usize>(result: &mut [f32], start: Start, left: Matrix, right: &Packed) {
+    let blocks =
+        blocks(right.rows, DEPTH).flat_map(|depth| blocks(left.rows, HEIGHT).map(move |rows| (rows, depth.clone())));
     if left.row_stride == 1 {
-        for (k, column) in columns.enumerate() {
-            for (tile, packed) in tiles.iter_mut().enumerate() {
-                let rows = rows(tile);
-                let from = &left.data[column * left.column_stride..][rows.clone()];
-                copy::<ROWS>(from, &mut packed[k][..rows.len()]);
+        // The columns of a block may be a page apart; a copy of the block needs fewer entries of the translation lookaside buffer.
+        let mut copies = [[0.0; HEIGHT]; DEPTH];
+        for (rows, depth) in blocks {
+            for (to, column) in copies.iter_mut().zip(depth.clone()) {
+                let from = &left.data[column * left.column_stride + rows.start..];
+                match from.first_chunk() {
+                    // Numbers behind the rows do no harm, and copying a fixed count needs no loop.
+                    Some(from) => *to = *from,
+                    None => to[..rows.len()].copy_from_slice(&from[..rows.len()]),
+                }
             }
+            let block = Matrix { data: copies.as_flattened(), rows: rows.len(), column_stride: HEIGHT, ..left };
+            compute_block::<P>(result, start, rows.start, depth, block, right);
         }
     } else {
-        for (tile, packed) in tiles.iter_mut().enumerate() {
-            for (i, row) in rows(tile).enumerate() {
-                for (packed, column) in packed.iter_mut().zip(columns.clone()) {
-                    packed[i] = left.data[row * left.row_stride + column * left.column_stride];
-                }
-            }
+        for (rows, depth) in blocks {
+            let data = &left.data[rows.start * left.row_stride + depth.start..];
+            let block = Matrix { data, rows: rows.len(), ..left };
+            compute_block::<P>(result, start, rows.start, depth, block, right);
         }
     }
 }
 
-/// Adds the product of the first `R` columns of `left`, transposed, and `right` to a tile that begins at `sum[0]`.
+/// Computes the rows of `result` from `row` on: the product of a block of the left matrix and the rows `depth` of the right one.
 #[inline(always)]
-fn add_tile<const R: usize>(
-    sum: &mut [f32],
-    stride: usize,
-    columns: usize,
-    left: &[[f32; ROWS]],
-    right: &[[f32; COLUMNS]],
+fn compute_block<const P: usize>(
+    result: &mut [f32],
+    start: Start,
+    row: usize,
+    depth: Range<usize>,
+    block: Matrix,
+    right: &Packed,
 ) {
-    let mut tile = [[0.0; COLUMNS]; R];
-    for (tile, sum) in tile.iter_mut().zip(sum.chunks(stride)) {
-        copy::<COLUMNS>(&sum[..columns], &mut tile[..columns]);
-    }
-    for (left, right) in left.iter().zip(right) {
-        for (tile, left) in tile.iter_mut().zip(left) {
-            *tile = multiply_add(*left, right, tile);
+    let width = right.columns;
+    let panels = right.panels[depth.start * width.div_ceil(COLUMNS)..].chunks(P * depth.len());
+    for (columns, panels) in blocks(width, P * COLUMNS).zip(panels) {
+        let result = &mut result[row * width + columns.start..];
+        let start = match start {
+            _ if depth.start > 0 => Start::Result,
+            Start::Row(row) => Start::Row(&row[columns.clone()]),
+            Start::Zeros | Start::Result => start,
+        };
+        if columns.len() > (P - 1) * COLUMNS {
+            let panels = from_fn(|i| &panels[i * depth.len()..][..depth.len()]);
+            compute_tiles::<P>(result, start, width, columns.len(), block, panels);
+        } else {
+            compute_tiles::<1>(result, start, width, columns.len(), block, [&panels[..depth.len()]]);
         }
     }
-    for (tile, sum) in tile.iter().zip(sum.chunks_mut(stride)) {
-        copy::<COLUMNS>(&tile[..columns], &mut sum[..columns]);
+}
+
+/// Computes tiles above each other, of about the same height: 4 and 4 rows rather than 6 and 2.
+#[inline(always)]
+fn compute_tiles<const P: usize>(
+    result: &mut [f32],
+    start: Start,
+    stride: usize,
+    columns: usize,
+    left: Matrix,
+    panels: [&[Row]; P],
+) {
+    let tiles = left.rows.div_ceil(ROWS);
+    for tile in 0..tiles {
+        let (row, end) = (tile * left.rows / tiles, (tile + 1) * left.rows / tiles);
+        let (result, data) = (&mut result[row * stride..], &left.data[row * left.row_stride..]);
+        let left = Matrix { data, rows: end - row, ..left };
+        match left.rows {
+            6 => compute_tile::<6, P>(result, start, stride, columns, left, panels),
+            5 => compute_tile::<5, P>(result, start, stride, columns, left, panels),
+            4 => compute_tile::<4, P>(result, start, stride, columns, left, panels),
+            3 => compute_tile::<3, P>(result, start, stride, columns, left, panels),
+            2 => compute_tile::<2, P>(result, start, stride, columns, left, panels),
+            _ => compute_tile::<1, P>(result, start, stride, columns, left, panels),
+        }
+    }
+}
+
+/// Computes a tile that begins at `result[0]`: the product of the first `R` rows of `left` and the panels.
+#[inline(always)]
+fn compute_tile<const R: usize, const P: usize>(
+    result: &mut [f32],
+    start: Start,
+    stride: usize,
+    columns: usize,
+    left: Matrix,
+    panels: [&[Row]; P],
+) {
+    let full = columns == P * COLUMNS;
+    let read = |tile: &mut [[f32; COLUMNS]; P], from: &[f32]| match from.as_chunks().0.first_chunk() {
+        Some(from) if full => *tile = *from,
+        _ => tile.as_flattened_mut()[..columns].copy_from_slice(&from[..columns]),
+    };
+    let mut tile = [[[0.0; COLUMNS]; P]; R];
+    match start {
+        Start::Zeros => {}
+        Start::Row(row) => tile.iter_mut().for_each(|tile| read(tile, row)),
+        Start::Result => tile.iter_mut().zip(result.chunks(stride)).for_each(|(tile, result)| read(tile, result)),
+    }
+    let depth = panels[0].len();
+    if left.row_stride == 1 {
+        for (k, column) in left.data.chunks(left.column_stride).take(depth).enumerate() {
+            add_outer(&mut tile, from_fn(|i| column[i]), from_fn(|p| panels[p][k].0));
+        }
+    } else {
+        let rows: [_; R] = from_fn(|i| &left.data[i * left.row_stride..][..depth]);
+        for k in 0..depth {
+            add_outer(&mut tile, from_fn(|i| rows[i][k]), from_fn(|p| panels[p][k].0));
+        }
+    }
+    for (tile, result) in tile.iter().zip(result.chunks_mut(stride)) {
+        match result.as_chunks_mut().0.first_chunk_mut() {
+            Some(result) if full => *result = *tile,
+            _ => result[..columns].copy_from_slice(&tile.as_flattened()[..columns]),
+        }
+    }
+}
+
+/// Adds the product of a column and a row, both as values, which the compiler keeps in registers, to a tile.
+#[inline(always)]
+fn add_outer<const R: usize, const P: usize>(
+    tile: &mut [[[f32; COLUMNS]; P]; R],
+    column: [f32; R],
+    row: [[f32; COLUMNS]; P],
+) {
+    for (tile, left) in tile.iter_mut().zip(column) {
+        for (tile, right) in tile.iter_mut().zip(row) {
+            *tile = multiply_add(left, &right, tile);
+        }
     }
 }
 
@@ -218,14 +325,32 @@ fn multiply_add(left: f32, right: &[f32; COLUMNS], sum: &[f32; COLUMNS]) -> [f32
     next
 }
 
-/// Copies a vector (N,) to each row of a matrix (M, N).
-pub(crate) fn fill_rows(matrix: &mut [f32], row: &[f32]) {
-    matrix.chunks_exact_mut(row.len()).for_each(|to| to.copy_from_slice(row));
-}
-
+vectorised! {
 /// Adds the rows of a matrix (M, N) to `sum` (N,), from the first to the last.
 pub(crate) fn add_rows(sum: &mut [f32], matrix: &[f32]) {
     for row in matrix.chunks_exact(sum.len()) {
         sum.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+    }
+}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tiles_of_both_widths_give_the_same_bits() {
+        let numbers = |count: usize| (0..count).map(|i| (i as f32 * 0.7).sin()).collect::<Vec<f32>>();
+        for (rows, depth, columns) in [(1, 1, 1), (50, 3, 31), (7, 260, 33), (64, 64, 48), (97, 300, 50)] {
+            let (left, right) = (numbers(rows * depth), numbers(depth * columns));
+            let mut packed = Packed::default();
+            packed.pack(Matrix::new(&right, columns));
+            for left in [Matrix::new(&left, depth), Matrix::new(&left, rows).t()] {
+                let (mut narrow, mut wide) = (numbers(rows * columns), numbers(rows * columns));
+                compute_blocks_with::<1>(&mut narrow, Start::Result, left, &packed);
+                compute_blocks_with::<2>(&mut wide, Start::Result, left, &packed);
+                assert_eq!(narrow, wide, "{rows} x {depth} x {columns}");
+            }
+        }
     }
 }
