@@ -199,7 +199,8 @@ fn compute_blocks_with<const P: usize>(result: &mut [f32], start: Start, left: M
 }
 
 /// Computes the rows of `result` from `row` on: the product of a block of the left matrix and the rows `depth` of the right one.
-#[inline(always)]
+/// Inlined only where [`vectorised`] requires it, since it is called twice and long: the page for browsers has to be small.
+#[cfg_attr(target_arch = "x86_64", inline(always))]
 fn compute_block<const P: usize>(
     result: &mut [f32],
     start: Start,
@@ -217,7 +218,8 @@ fn compute_block<const P: usize>(
             Start::Row(row) => Start::Row(&row[columns.clone()]),
             Start::Zeros | Start::Result => start,
         };
-        if columns.len() > (P - 1) * COLUMNS {
+        // The compiler drops the other branch where panels are computed one at a time.
+        if P == 1 || columns.len() > (P - 1) * COLUMNS {
             let panels = from_fn(|i| &panels[i * depth.len()..][..depth.len()]);
             compute_tiles::<P>(result, start, width, columns.len(), block, panels);
         } else {
