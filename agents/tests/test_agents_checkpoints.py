@@ -210,7 +210,7 @@ def test_a_full_disk_leaves_the_former_checkpoint(file: Path, tmp_path: Path) ->
 
 def test_a_kill_while_saving_leaves_a_whole_checkpoint(file: Path, tmp_path: Path) -> None:
     run, state = tmp_path / "run", torch.load(file, weights_only=True)
-    #: One byte for each save: a kill cannot leave an older number behind, as between truncating and writing a file.
+    # Has one byte for each save. A number that is written anew could be lost if the kill comes after the file was emptied.
     saved = run / "saved"
 
     def save() -> None:

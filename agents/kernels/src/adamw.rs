@@ -58,6 +58,7 @@ impl AdamW {
 }
 
 vectorised! {
+/// The loop of [`AdamW::update`]; `root` is the square root of `1 - 0.999^t`.
 fn update(w: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32], decay: f32, step: f32, root: f32) {
     let (new_mean, new_square) = ((1.0 - AdamW::BETA.0) as f32, (1.0 - AdamW::BETA.1) as f32);
     for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {

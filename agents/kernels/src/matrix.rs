@@ -199,7 +199,8 @@ fn compute_blocks_with<const P: usize>(result: &mut [f32], start: Start, left: M
 }
 
 /// Computes the rows of `result` from `row` on: the product of a block of the left matrix and the rows `depth` of the right one.
-/// Inlined only where [`vectorised`] requires it, since it is called twice and long: the page for browsers has to be small.
+///
+/// It is long and called twice, so it is inlined only where `vectorised` needs that, which keeps the page for browsers small.
 #[cfg_attr(target_arch = "x86_64", inline(always))]
 fn compute_block<const P: usize>(
     result: &mut [f32],
