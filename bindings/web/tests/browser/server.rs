@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 pub struct PageServer {
     address: SocketAddr,
@@ -53,7 +54,7 @@ impl Drop for PageServer {
     }
 }
 
-/// Answers one request and closes the connection.
+/// Answers one request and closes the connection. With `?slow` the answer comes in pieces, so that a browser shows parts of a document.
 fn answer(folder: &Path, mut connection: TcpStream) -> std::io::Result<()> {
     let mut lines = BufReader::new(connection.try_clone()?).lines();
     let Some(request) = lines.next().transpose()? else { return Ok(()) };
@@ -80,5 +81,12 @@ fn answer(folder: &Path, mut connection: TcpStream) -> std::io::Result<()> {
         connection,
         "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n"
     )?;
-    connection.write_all(&bytes)
+    if !path.contains("?slow") {
+        return connection.write_all(&bytes);
+    }
+    for piece in bytes.chunks(1000) {
+        connection.write_all(piece)?;
+        std::thread::sleep(Duration::from_millis(60));
+    }
+    Ok(())
 }
