@@ -34,7 +34,7 @@ from endless_gym_agents.ranges import Positive
 from endless_gym_agents.settings import Settings, to_dict
 
 #: The agents that the page can compute.
-PAGE_AGENTS = ("gru", "mingru", "none")
+PAGE_AGENTS = ("gru", "mingru", "gated-deltanet", "mamba2", "retnet", "none")
 #: Seed of the episodes and of the sampled actions of recorded vectors.
 VECTORS_SEED = 200_000
 

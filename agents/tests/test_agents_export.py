@@ -60,7 +60,7 @@ def test_an_exported_agent_is_read_back(tmp_path: Path) -> None:
 
 def test_agents_that_the_page_cannot_compute_are_refused(tmp_path: Path) -> None:
     run = trained(tmp_path, agent="lstm")
-    with pytest.raises(ValueError, match="--agent must be gru, mingru, none, got lstm"):
+    with pytest.raises(ValueError, match="--agent must be gru, mingru, gated-deltanet, mamba2, retnet, none, got lstm"):
         export.execute(export.ExportArguments(run, out=tmp_path / "agent.safetensors"))
 
 

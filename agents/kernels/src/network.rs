@@ -292,11 +292,8 @@ impl Network {
 
     /// Computes logits, values and hidden states of all steps.
     pub fn forward(&self, sequences: Sequences, pass: &mut Pass) {
+        self.encode(pass);
         let p = &self.parameters[..];
-        self.encoder.forward_relu(p, &pass.observations, &mut pass.encoded);
-        if let Some(embedding) = &self.embedding {
-            embedding.forward_relu(p, &pass.encoded, &mut pass.embedded);
-        }
         let embedded = if self.embedding.is_some() { &pass.embedded } else { &pass.encoded };
         let (steps, hidden_size) = (sequences.steps(), self.spec.hidden_size);
         pass.layers.resize_with(self.memory.len(), LayerPass::default);
@@ -320,6 +317,28 @@ impl Network {
         if self.spec.residual {
             add(&mut pass.remembered, embedded);
         }
+        self.decide(pass);
+    }
+
+    /// Computes logits and values with another memory, which gets its inputs and returns outputs of the same shape. The network has
+    /// no layers of its own then.
+    pub fn forward_with(&self, pass: &mut Pass, memory: impl FnOnce(&[f32]) -> Vec<f32>) {
+        self.encode(pass);
+        pass.remembered = memory(if self.embedding.is_some() { &pass.embedded } else { &pass.encoded });
+        self.decide(pass);
+    }
+
+    /// The layers before the memory.
+    fn encode(&self, pass: &mut Pass) {
+        self.encoder.forward_relu(&self.parameters, &pass.observations, &mut pass.encoded);
+        if let Some(embedding) = &self.embedding {
+            embedding.forward_relu(&self.parameters, &pass.encoded, &mut pass.embedded);
+        }
+    }
+
+    /// The layers after the memory.
+    fn decide(&self, pass: &mut Pass) {
+        let p = &self.parameters[..];
         self.body.forward_relu(p, &pass.remembered, &mut pass.body);
         self.policy_hidden.forward_relu(p, &pass.body, &mut pass.policy_hidden);
         self.policy.forward(p, &pass.policy_hidden, &mut pass.logits);

@@ -1,13 +1,15 @@
 //! Trained agents that observe features: files of `endless learn` and of `endless_gym_agents.export`, in the format safetensors.
 
+mod linear_attention;
 #[cfg(test)]
 mod tests;
 
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::random::{Generator, SeedSequence};
 use endless_gym_kernels::categorical;
-use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass, Tensor};
+use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass};
 use endless_gym_kernels::sequences::Sequences;
+use linear_attention::{Kind, Sizes, Stack, State};
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::Deserialize;
 use serde_json::{Map, Value as Json, json};
@@ -28,7 +30,7 @@ pub enum AgentFileError {
     Metadata,
     #[error("the header of an agent cannot be read: {0}")]
     Header(#[from] serde_json::Error),
-    #[error("an agent on the page must be gru, mingru or none, got {given}")]
+    #[error("an agent on the page must be gru, mingru, gated-deltanet, mamba2, retnet or none, got {given}")]
     Kind { given: String },
     #[error("the agent must have a float32 tensor `{name}` of shape {expected}, got {given}")]
     Tensor { name: String, expected: String, given: String },
@@ -69,11 +71,14 @@ struct Recurrence {
 pub struct Agent {
     header: Header,
     network: Network,
+    /// A memory that is not one of the network's.
+    stack: Option<Stack>,
 }
 
 /// An agent's state within an episode.
 pub struct Memory {
     pass: Pass,
+    stack: Vec<State>,
     random: Generator,
 }
 
@@ -85,8 +90,9 @@ impl Agent {
         let text = metadata.metadata().as_ref().and_then(|entries| entries.get(METADATA));
         let header: Header = serde_json::from_str(text.ok_or(AgentFileError::Metadata)?)?;
         let spec = network_spec(&header.settings, &tensors)?;
-        let network = Network::new(spec, |tensor| weights(&tensors, tensor))?;
-        Ok(Agent { header, network })
+        let network = Network::new(spec, |tensor| weights(&tensors, &tensor.name, &tensor.shape))?;
+        let stack = kind(&header.settings).map(|kind| stack(kind, &network.spec, &tensors)).transpose()?;
+        Ok(Agent { header, network, stack })
     }
 
     /// The id of the environment that it was trained in.
@@ -109,12 +115,13 @@ impl Agent {
         let stream = SeedSequence::new(seed).with_spawn_key(&[1]);
         let (spec, mut pass) = (&self.network.spec, Pass::default());
         pass.states = vec![vec![0.0; spec.hidden_size]; spec.layers];
-        Memory { pass, random: Generator::from_seed_sequence(&stream) }
+        let stack = self.stack.as_ref().map(Stack::start).unwrap_or_default();
+        Memory { pass, stack, random: Generator::from_seed_sequence(&stream) }
     }
 
     /// Samples an action for the features of a step, and updates the memory.
     pub fn act(&self, features: &[f32], memory: &mut Memory, action: &mut [i32]) {
-        self.step(features, &mut memory.pass);
+        self.step(features, memory);
         let choices = &self.network.spec.choices;
         let noise: Vec<f32> =
             memory.pass.logits.iter().map(|_| categorical::gumbel(memory.random.random_f32())).collect();
@@ -123,10 +130,13 @@ impl Agent {
         action.iter_mut().zip(chosen).for_each(|(action, chosen)| *action = chosen as i32);
     }
 
-    /// Computes the logits of all branches, and the hidden states after the step.
-    fn step(&self, features: &[f32], pass: &mut Pass) {
+    /// Computes the logits of all branches, and the states after the step.
+    fn step(&self, features: &[f32], Memory { pass, stack: states, .. }: &mut Memory) {
         pass.observations.clear();
         pass.observations.extend_from_slice(features);
+        if let Some(stack) = &self.stack {
+            return self.network.forward_with(pass, |x| stack.step(x, states));
+        }
         self.network.forward(Sequences::new(&[1], &[]).expect("one step"), pass);
         for layer in 0..pass.states.len() {
             let after = pass.hidden(layer).to_vec();
@@ -154,35 +164,51 @@ impl Agent {
     }
 }
 
+/// The kind of a memory that is not one of the network's.
+fn kind(settings: &Settings) -> Option<Kind> {
+    match &*settings.agent {
+        "gated-deltanet" => Some(Kind::GatedDeltaNet),
+        "mamba2" => Some(Kind::Mamba2),
+        "retnet" => Some(Kind::RetNet),
+        _ => None,
+    }
+}
+
+/// The size of a tensor on an axis, 1 to `MAX_SIZE`.
+fn size(tensors: &SafeTensors, name: &str, axis: usize) -> Result<usize, AgentFileError> {
+    let given = tensors.tensor(name).map(|tensor| tensor.shape().to_vec()).ok();
+    let size = given.as_ref().and_then(|shape| shape.get(axis).copied());
+    size.filter(|size| (1..=MAX_SIZE).contains(size)).ok_or_else(|| AgentFileError::Tensor {
+        name: name.to_owned(),
+        expected: format!("1 to {MAX_SIZE} on axis {axis}"),
+        given: given.map_or_else(|| "none".to_owned(), |shape| format!("{shape:?}")),
+    })
+}
+
+/// How many of the layers that `name` gives the name of a tensor for are in the file.
+fn count(tensors: &SafeTensors, name: impl Fn(usize) -> String) -> usize {
+    (0..MAX_LAYERS).take_while(|layer| tensors.tensor(&name(*layer)).is_ok()).count()
+}
+
 /// Kinds and sizes of the layers, from the shapes of a file's tensors.
 fn network_spec(settings: &Settings, tensors: &SafeTensors) -> Result<NetworkSpec, AgentFileError> {
-    let has = |name: &str| tensors.tensor(name).is_ok();
-    let size = |name: &str, axis: usize| {
-        let given = tensors.tensor(name).map(|tensor| tensor.shape().to_vec()).ok();
-        let size = given.as_ref().and_then(|shape| shape.get(axis).copied());
-        size.filter(|size| (1..=MAX_SIZE).contains(size)).ok_or_else(|| AgentFileError::Tensor {
-            name: name.to_owned(),
-            expected: format!("1 to {MAX_SIZE} on axis {axis}"),
-            given: given.map_or_else(|| "none".to_owned(), |shape| format!("{shape:?}")),
-        })
-    };
+    let size = |name: &str, axis: usize| size(tensors, name, axis);
     let gru = |layer: usize| format!("memory.recurrent.bias_hh_l{layer}");
     let mingru = |layer: usize| format!("memory.cell.layers.{layer}.projection.bias");
-    let count = |name: &dyn Fn(usize) -> String| (0..MAX_LAYERS).take_while(|layer| has(&name(*layer))).count();
     let (memory, layers, hidden_size) = match &*settings.agent {
-        "gru" => (Layers::Gru, count(&gru), size("memory.recurrent.weight_hh_l0", 1)?),
-        "mingru" => (Layers::MinGru, count(&mingru), size(&mingru(0), 0)?.div_ceil(2)),
+        "gru" => (Layers::Gru, count(tensors, gru), size("memory.recurrent.weight_hh_l0", 1)?),
+        "mingru" => (Layers::MinGru, count(tensors, mingru), size(&mingru(0), 0)?.div_ceil(2)),
         "none" => (Layers::Gru, 0, 1),
+        _ if kind(settings).is_some() => (Layers::Gru, 0, size("memory.cell.norms.0.weight", 0)?),
         given => return Err(AgentFileError::Kind { given: given.to_owned() }),
     };
     let branch = |branch: usize| format!("policy.branches.{branch}.weight");
     // Without the first one, that is an error.
-    let branches = (0..MAX_LAYERS).map(branch).take_while(|name| has(name) || *name == branch(0));
-    let choices = branches.map(|name| size(&name, 0));
+    let choices = (0..count(tensors, branch).max(1)).map(|i| size(&branch(i), 0));
     Ok(NetworkSpec {
         observation_width: size("encoder.vector.0.weight", 1)?,
         encoder_width: size("encoder.vector.0.weight", 0)?,
-        embedding: has("memory.embedding.0.weight"),
+        embedding: tensors.tensor("memory.embedding.0.weight").is_ok(),
         memory,
         layers,
         hidden_size,
@@ -193,20 +219,44 @@ fn network_spec(settings: &Settings, tensors: &SafeTensors) -> Result<NetworkSpe
     })
 }
 
-/// The weights of a tensor.
-fn weights(tensors: &SafeTensors, tensor: &Tensor) -> Result<Vec<f32>, AgentFileError> {
-    let (name, found) = (&tensor.name, tensors.tensor(&tensor.name).ok());
-    let Some(view) = found.as_ref().filter(|view| view.dtype() == Dtype::F32 && view.shape() == tensor.shape) else {
+/// The layers of linear attention between the others.
+fn stack(kind: Kind, spec: &NetworkSpec, tensors: &SafeTensors) -> Result<Stack, AgentFileError> {
+    let layers = count(tensors, |layer| format!("memory.cell.layers.{layer}.enter.weight"));
+    let size = |name: &str, axis: usize| size(tensors, &format!("memory.cell.layers.0.{name}"), axis);
+    let width = spec.hidden_size;
+    let (heads, inner, keys) = match kind {
+        Kind::GatedDeltaNet => (size("a_log", 0)?, width, width / size("a_log", 0)?),
+        Kind::RetNet => (width / size("norm.weight", 0)?, width, size("norm.weight", 0)?),
+        Kind::Mamba2 => {
+            let inner = size("leave.weight", 1)?;
+            (size("a_log", 0)?, inner, size("convolution.bias", 0)?.saturating_sub(inner) / 2)
+        }
+    };
+    let inputs = if spec.embedding { width } else { spec.encoder_width };
+    if keys == 0 || heads == 0 || inner % heads != 0 || inputs != width {
         return Err(AgentFileError::Tensor {
-            name: name.clone(),
-            expected: format!("{:?}", tensor.shape),
+            name: "memory.cell.layers.0.leave.weight".to_owned(),
+            expected: format!("a multiple of the heads, and {inputs} inputs"),
+            given: format!("{inner} for {heads} heads, and {width} inputs"),
+        });
+    }
+    Stack::new(kind, layers, Sizes { width, heads, inner, keys }, |name, shape| weights(tensors, &name, shape))
+}
+
+/// The weights of a tensor.
+fn weights(tensors: &SafeTensors, name: &str, shape: &[usize]) -> Result<Vec<f32>, AgentFileError> {
+    let found = tensors.tensor(name).ok();
+    let Some(view) = found.as_ref().filter(|view| view.dtype() == Dtype::F32 && view.shape() == shape) else {
+        return Err(AgentFileError::Tensor {
+            name: name.to_owned(),
+            expected: format!("{shape:?}"),
             given: found.map_or_else(|| "none".to_owned(), |view| format!("{:?} {:?}", view.dtype(), view.shape())),
         });
     };
     let (numbers, _) = view.data().as_chunks();
     let weights: Vec<f32> = numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
     match weights.iter().find(|weight| !weight.is_finite()) {
-        Some(given) => Err(AgentFileError::NotFinite { name: name.clone(), given: *given }),
+        Some(given) => Err(AgentFileError::NotFinite { name: name.to_owned(), given: *given }),
         None => Ok(weights),
     }
 }

@@ -33,32 +33,42 @@ fn largest_difference(found: &[f32], expected: &[f32]) -> f32 {
 
 #[test]
 fn the_networks_compute_what_pytorch_computes() {
-    for id in ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0"] {
-        let file = std::fs::read(format!("../../engine/view/page/files/{id}.safetensors")).unwrap();
-        assert!(file.len() <= 100_000, "{id}: {} bytes", file.len());
-        let vectors = std::fs::read_to_string(format!("tests/agents/{id}.json")).unwrap();
+    let (of_the_page, of_tests) = ("../../engine/view/page/files", "tests/agents");
+    for (folder, name) in [
+        (of_the_page, "MortarMayhem-Grid-v0"),
+        (of_the_page, "MysteryPath-Grid-v0"),
+        (of_the_page, "SearingSpotlights-v0"),
+        // Two layers of two heads each.
+        (of_tests, "gated-deltanet"),
+        (of_tests, "mamba2"),
+        (of_tests, "retnet"),
+    ] {
+        let file = std::fs::read(format!("{folder}/{name}.safetensors")).unwrap();
+        assert!(file.len() <= 100_000, "{name}: {} bytes", file.len());
+        let vectors = std::fs::read_to_string(format!("{of_tests}/{name}.json")).unwrap();
         computes(&Agent::read(&file).unwrap(), &serde_json::from_str(&vectors).unwrap());
     }
 }
 
 fn computes(agent: &Agent, vectors: &Vectors) {
     assert_eq!(agent.env(), vectors.env);
-    let mut pass = agent.memory(0).pass;
+    let mut memory = agent.memory(0);
     let mut episodes = 0;
     for ((features, expected), reset) in vectors.features.iter().zip(&vectors.logits).zip(&vectors.reset) {
         if *reset {
-            pass = agent.memory(0).pass;
+            memory = agent.memory(0);
             episodes += 1;
         }
-        agent.step(features, &mut pass);
-        assert!(largest_difference(&pass.logits, expected) <= 1e-5, "{:?} {expected:?}", pass.logits);
+        agent.step(features, &mut memory);
+        let found = &memory.pass.logits;
+        assert!(largest_difference(found, expected) <= 1e-5, "{found:?} {expected:?}");
     }
     assert!(episodes >= 2 && vectors.features.len() >= 90, "{episodes} episodes");
     // Without the hidden state, the logits differ.
     let last = vectors.features.len() - 1;
-    let mut forgotten = agent.memory(0).pass;
+    let mut forgotten = agent.memory(0);
     agent.step(&vectors.features[last], &mut forgotten);
-    assert!(vectors.reset[last] || largest_difference(&forgotten.logits, &vectors.logits[last]) > 0.01);
+    assert!(vectors.reset[last] || largest_difference(&forgotten.pass.logits, &vectors.logits[last]) > 0.01);
 }
 
 #[test]
@@ -145,7 +155,10 @@ fn a_broken_file_is_refused() {
     assert!(matches!(replaced("\"endless\"", "\"nothing\""), AgentFileError::Metadata));
     assert!(matches!(replaced(r#"\"steps\":"#, r#"\"stops\":"#), AgentFileError::Header(_)));
     let kind = replaced(r#"\"agent\":\"gru\""#, r#"\"agent\":\"abc\""#);
-    assert_eq!(kind.to_string(), "an agent on the page must be gru, mingru or none, got abc");
+    assert_eq!(
+        kind.to_string(),
+        "an agent on the page must be gru, mingru, gated-deltanet, mamba2, retnet or none, got abc"
+    );
     let bias = replaced("\"memory.embedding.0.bias\"", "\"memory.embedding.9.bias\"");
     let text = "the agent must have a float32 tensor `memory.embedding.0.bias` of shape [48], got none";
     assert_eq!(bias.to_string(), text);
@@ -155,30 +168,92 @@ fn a_broken_file_is_refused() {
 #[test]
 fn a_damaged_file_is_refused_or_plays() {
     let draws = &mut Generator::from_seed(35);
-    let header = u64::from_le_bytes(AGENT[..8].try_into().unwrap()) as usize;
-    let words =
-        ["0", "-1", "4096", "1e400", "18446744073709551615", "null", "[]", "{", "\"", "\\", "F64", "[[[[", "gru", ""];
-    let (mut refused, mut played) = (0, 0);
-    for _ in 0..2_000 {
-        let mut text = AGENT[8..8 + header].to_vec();
-        for _ in 0..draws.integers(1, 4) {
-            let start = draws.integers(0, text.len() as i64) as usize;
-            let end = (start + draws.integers(0, 8) as usize).min(text.len());
-            text.splice(start..end, draws.choice(&words).bytes());
-        }
-        let file = [&(text.len() as u64).to_le_bytes(), &text[..], &AGENT[8 + header..]].concat();
-        match Agent::read(&file) {
-            Err(_) => refused += 1,
-            Ok(agent) => {
-                let features = vec![1.0; agent.network.spec.observation_width];
-                let mut action = vec![-1; agent.network.spec.choices.len()];
-                agent.act(&features, &mut agent.memory(1), &mut action);
-                let choices = agent.network.spec.choices.iter().map(|choices| *choices as i32);
-                assert!(action.iter().zip(choices).all(|(action, choices)| (0..choices).contains(action)));
-                assert!(agent.description().is_object());
-                played += 1;
+    let stacks =
+        ["gated-deltanet", "mamba2", "retnet"].map(|name| std::fs::read(format!("tests/agents/{name}.safetensors")));
+    let mut files = vec![AGENT.to_vec()];
+    files.extend(stacks.map(Result::unwrap));
+    let words = [
+        "0",
+        "-1",
+        "4096",
+        "1e400",
+        "18446744073709551615",
+        "null",
+        "[]",
+        "{",
+        "\"",
+        "\\",
+        "F64",
+        "[[[[",
+        "gru",
+        "retnet",
+        "",
+    ];
+    for whole in files {
+        let header = u64::from_le_bytes(whole[..8].try_into().unwrap()) as usize;
+        let (mut refused, mut played) = (0, 0);
+        for _ in 0..1_000 {
+            let mut text = whole[8..8 + header].to_vec();
+            for _ in 0..draws.integers(1, 4) {
+                let start = draws.integers(0, text.len() as i64) as usize;
+                let end = (start + draws.integers(0, 8) as usize).min(text.len());
+                text.splice(start..end, draws.choice(&words).bytes());
+            }
+            let file = [&(text.len() as u64).to_le_bytes(), &text[..], &whole[8 + header..]].concat();
+            match Agent::read(&file) {
+                Err(_) => refused += 1,
+                Ok(agent) => {
+                    let features = vec![1.0; agent.network.spec.observation_width];
+                    let mut action = vec![-1; agent.network.spec.choices.len()];
+                    agent.act(&features, &mut agent.memory(1), &mut action);
+                    let choices = agent.network.spec.choices.iter().map(|choices| *choices as i32);
+                    assert!(action.iter().zip(choices).all(|(action, choices)| (0..choices).contains(action)));
+                    assert!(agent.description().is_object());
+                    played += 1;
+                }
             }
         }
+        assert!(refused > 250 && played > 50, "{refused} refused, {played} played");
     }
-    assert!(refused > 500 && played > 100, "{refused} refused, {played} played");
+}
+
+/// Files with whole tensors of other shapes and kinds: what their header says is true, so that only the agent can refuse it.
+#[test]
+fn layers_that_do_not_fit_are_refused() {
+    for name in ["gated-deltanet", "mamba2", "retnet"] {
+        let file = std::fs::read(format!("tests/agents/{name}.safetensors")).unwrap();
+        let tensors = SafeTensors::deserialize(&file).unwrap();
+        let metadata = SafeTensors::read_metadata(&file).unwrap().1.metadata().clone();
+        let mut shapes = 0;
+        for changed in tensors.names() {
+            for axis in 0..tensors.tensor(changed).unwrap().shape().len() {
+                for size in [0, 1, 3, 5, 7, 24, 48] {
+                    let views = tensors.iter().map(|(name, view)| {
+                        let (mut shape, mut data) = (view.shape().to_vec(), view.data().to_vec());
+                        if name == changed {
+                            shape[axis] = size;
+                            data = vec![0; 4 * shape.iter().product::<usize>()];
+                        }
+                        (name.to_owned(), shape, data)
+                    });
+                    let views: Vec<_> = views.collect();
+                    let views = views.iter().map(|(name, shape, data)| {
+                        (name, safetensors::tensor::TensorView::new(Dtype::F32, shape.clone(), data).unwrap())
+                    });
+                    let changed_file = safetensors::serialize(views, metadata.clone()).unwrap();
+                    let same = tensors.tensor(changed).unwrap().shape()[axis] == size;
+                    // A policy may have other choices, and an observation other features.
+                    if let Ok(agent) = Agent::read(&changed_file) {
+                        let features = vec![1.0; agent.network.spec.observation_width];
+                        let mut action = vec![0; agent.network.spec.choices.len()];
+                        agent.act(&features, &mut agent.memory(1), &mut action);
+                    } else {
+                        assert!(!same, "{changed}");
+                        shapes += 1;
+                    }
+                }
+            }
+        }
+        assert!(shapes > 200, "{name}: {shapes}");
+    }
 }

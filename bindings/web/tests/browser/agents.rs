@@ -1,5 +1,7 @@
 //! Tests trained agents on the page, and the flash.
 
+use std::path::Path;
+
 use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 
@@ -141,6 +143,36 @@ fn only_environments_with_an_agent_offer_it() {
         assert!(text(&mut browser, "message").contains(message), "{}", text(&mut browser, "message"));
         assert_eq!(browser.value("endless.play.player"), "person");
     }
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn an_agent_of_a_file_plays() {
+    let (server, mut browser) = (PageServer::start("web"), start("opened-agents"));
+    visit(&mut browser, &server, "env=MysteryPath-v0&seed=7");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/agents");
+    for (name, kind) in [("gated-deltanet", "A Gated DeltaNet"), ("mamba2", "A Mamba-2"), ("retnet", "A RetNet")] {
+        browser.choose("#file", &folder.join(format!("{name}.safetensors")));
+        browser.wait(&format!("document.getElementById('trained').textContent.startsWith('{kind}')"));
+        let state = browser.value(STATE);
+        assert_eq!((&state["id"], &state["seed"]), (&json!(ID), &json!("7")));
+        assert_eq!(state["options"], json!({"command_count": "[1,2]"}));
+        assert_eq!(browser.value("endless.play.player"), "agent");
+        browser.value("endless.play.stop(); while (!endless.play.state.done) endless.play.oneStep()");
+        assert!(text(&mut browser, "successes").ends_with(" of 1."), "{}", text(&mut browser, "successes"));
+    }
+    // An agent of an environment that is not on the page.
+    let mut other = std::fs::read(folder.join("retnet.safetensors")).unwrap();
+    let at = other.windows(ID.len()).position(|window| window == ID.as_bytes()).unwrap();
+    other[at + ID.len() - 1] = b'9';
+    let file = std::env::temp_dir().join(format!("endless-page-{}.safetensors", std::process::id()));
+    std::fs::write(&file, other).unwrap();
+    browser.choose("#file", &file);
+    browser.wait(
+        "document.getElementById('message').textContent.endsWith('MortarMayhem-Grid-v9, which is not on this page')",
+    );
+    std::fs::remove_file(file).unwrap();
+    assert_eq!(browser.complaints, Vec::<String>::new());
 }
 
 #[test]

@@ -1,7 +1,12 @@
 // The trained agents, and their results on the page.
 
-/** The environments with a trained agent, in the file ID.safetensors; docs/train/agents.md describes how to make one. */
+/** The environments with a trained agent of the page, in the file ID.safetensors; docs/train/agents.md describes how to make one. */
 const IDS = ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0"];
+
+/** Names of the agents in sentences. */
+const KINDS = {
+  gru: "A GRU", mingru: "A minGRU", "gated-deltanet": "A Gated DeltaNet", mamba2: "A Mamba-2", retnet: "A RetNet", none: "An agent without memory",
+};
 
 export class Agents {
   #loaded = new Map();
@@ -12,7 +17,7 @@ export class Agents {
   }
 
   has(id) {
-    return IDS.includes(id);
+    return IDS.includes(id) || this.#loaded.has(id);
   }
 
   /** Why there is no agent, or an empty string. */
@@ -32,8 +37,19 @@ export class Agents {
     const url = new URL(`${id}.safetensors`, import.meta.url);
     const response = await fetch(url);
     if (!response.ok) throw new Error(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
-    this.#loaded.set(id, this.engine.loadAgent(new Uint8Array(await response.arrayBuffer())));
-    return this.#loaded.get(id);
+    return this.#read(new Uint8Array(await response.arrayBuffer()));
+  }
+
+  /** Reads an agent's file; the agent plays the environment that it was trained in instead of another one. Returns its description. */
+  open(bytes) {
+    this.#counts.clear();
+    return this.#read(bytes);
+  }
+
+  #read(bytes) {
+    const description = this.engine.loadAgent(bytes);
+    this.#loaded.set(description.env, description);
+    return description;
   }
 
   /** The reset parameters that an agent was trained with, as texts of the form. */
@@ -58,9 +74,8 @@ export class Agents {
       const given = Object.entries(options).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`);
       return `${Math.round(100 * success)} %` + (given.length ? ` with ${given.join(" and ")}` : "");
     };
-    const kind = { gru: "A GRU", mingru: "A minGRU", none: "An agent without memory" }[agent];
     const measured = evaluation.length ? `; it succeeds in ${evaluation.map(share).join(", ")}` : "";
-    return `${kind}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
+    return `${KINDS[agent]}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
   }
 }
 

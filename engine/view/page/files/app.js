@@ -207,6 +207,7 @@ class App {
     $("file").value = "";
     if (!file) return;
     try {
+      if (file.name.endsWith(".safetensors")) return this.#openAgent(new Uint8Array(await file.arrayBuffer()));
       const { episodes, steps, differences, first } = this.play.open(new Uint8Array(await file.arrayBuffer()));
       this.#view("play");
       const verdict = differences === 0 ? "replayed without a difference" : `${differences} differences, the first in ${first}`;
@@ -214,6 +215,16 @@ class App {
     } catch (error) {
       say(`${file.name}: ${error.message}`, "open");
     }
+  }
+
+  /** Lets the agent of a file play. */
+  #openAgent(bytes) {
+    const { env } = this.play.agents.open(bytes);
+    if (!this.specs.some(({ id }) => id === env)) throw new Error(`the agent was trained in ${env}, which is not on this page`);
+    this.#view("play");
+    $("agent").hidden = false;
+    const { seed } = this.play.state ?? {};
+    this.play.playAgent({ id: env, options: {}, seed: seed ?? randomSeed() });
   }
 
   async #copy() {
