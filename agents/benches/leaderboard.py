@@ -4,6 +4,7 @@
     python leaderboard.py laptop --agents gru mingru --tasks one-command --seeds 1
     python leaderboard.py laptop --agents own.py:Mine   # a memory of your own; repeat with other --sizes
     python leaderboard.py laptop --table                # only the table, from the scores so far
+    python leaderboard.py laptop --table --best best    # and the best agent of each task, to open on the page
 
 A track is a file `leaderboard/TRACK.json`: tasks, agents, sizes, seeds, and the flags that all runs share. Each run is one
 `endless-train` and one `endless-eval`, with `endless-reproduce`, so that the same command resumes what was interrupted and
@@ -26,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from endless_gym_agents import checkpoint, reproduce
+from endless_gym_agents import checkpoint, export, reproduce
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.conformance import state_bytes
 from endless_gym_agents.evaluate import evaluate, mean
@@ -110,6 +111,24 @@ def longer(agent: Agent, task: Task, seeds: int) -> float:
         return mean(evaluate(agent, range(200_000, 200_000 + seeds), 1, num_threads=1))
     finally:
         agent.settings = trained
+
+
+def export_best(done: dict[str, list[tuple[float, Job]]], folder: Path) -> None:
+    """Write the best agent of each task, among those that the page can compute, as TASK.safetensors.
+
+    Args:
+        done: Scores and runs of each task.
+        folder: Folder to write to; made if it does not exist.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for task, runs in done.items():
+        known = [run for run in runs if run[1].run.flags["agent"] in export.PAGE_AGENTS]
+        if not known or TASKS[task].env.startswith("popgym"):
+            print(f"{task}: no agent that the page can compute")
+            continue
+        score, job = max(known, key=lambda run: run[0])
+        print(f"{task}: {job.run.flags['agent']} with seed {job.seed}, mean return {score:.3f}")
+        export.execute(export.ExportArguments(job.folder, out=folder / f"{task}.safetensors"))
 
 
 def zeros(track: dict[str, Any], rows: list[dict[str, Any]]) -> dict[str, float]:
@@ -232,6 +251,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="file of the rows (default: that of the track)")
     parser.add_argument("--scale", default="1", help="a smaller version, for a try, as for endless-reproduce")
     parser.add_argument("--table", action="store_true", help="train nothing, write the table")
+    parser.add_argument("--best", type=Path, help="folder to export the best agent of each task to, for the page")
     args = parser.parse_args()
     track = read(args.track)
     tasks, agents = args.tasks or track["tasks"], args.agents or track["agents"]
@@ -262,11 +282,13 @@ def main() -> None:
         for run in written["runs"]
     }
     torch.set_num_threads(1)
+    done: dict[str, list[tuple[float, Job]]] = {}
     for job in planning.jobs(definitions.load(str(file)), args.out, planning.read_scale(args.scale), seeds):
         if job.state() == "done":
             task, agent, size = named[job.run.name]
             found = row(job, TASKS[task], Path(agent).name, size)
             rows[tuple(found[key] for key in KEYS)] = found
+            done.setdefault(task, []).append((found["score"], job))
     machine = {
         "machine": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
@@ -280,6 +302,8 @@ def main() -> None:
     )
     results.with_name(f"{results.name.partition('.')[0]}.md").write_text(table(track, list(rows.values())))
     print(f"{len(rows)} rows in {results}")
+    if args.best is not None:
+        export_best(done, args.best)
     if failure is not None:
         raise SystemExit(str(failure))
 

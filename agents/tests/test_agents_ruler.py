@@ -117,6 +117,13 @@ def test_the_program_fills_the_table_and_resumes(
     page = (tmp_path / "laptop.md").read_text()
     assert "| `ffm` | gru |" in page
     assert "| one-command | object | 0.1 |" in page
+    # The best agent of a task, of those that the page plays; the page has no POPGym.
+    best = tmp_path / "best"
+    run("--agents", "none", "mingru", "ffm", "--tasks", "one-command", "repeat-first", "--table", "--best", str(best))
+    assert [file.name for file in best.iterdir()] == ["one-command.safetensors"]
+    scores = {row["agent"]: row["score"] for row in rows if row["task"] == "one-command"}
+    exported = checkpoint.load(best / "one-command.safetensors").agent
+    assert scores[exported.settings.agent] == max(scores.values())
 
 
 def test_the_interquartile_mean_is_that_of_normalised_scores(leaderboard: ModuleType) -> None:
