@@ -34,6 +34,11 @@ pub enum AgentFileError {
     Kind { given: String },
     #[error("the agent must have a float32 tensor `{name}` of shape {expected}, got {given}")]
     Tensor { name: String, expected: String, given: String },
+    #[error(
+        "the {heads} heads of the agent's memory must divide {channels} channels with at least one key each, and its {width} inputs \
+         must be the {given} outputs of the layer before"
+    )]
+    Heads { heads: usize, channels: usize, width: usize, given: usize },
     #[error("the weights of an agent must be finite, got {given} in `{name}`")]
     NotFinite { name: String, given: f32 },
 }
@@ -234,11 +239,7 @@ fn stack(kind: Kind, spec: &NetworkSpec, tensors: &SafeTensors) -> Result<Stack,
     };
     let inputs = if spec.embedding { width } else { spec.encoder_width };
     if keys == 0 || heads == 0 || inner % heads != 0 || inputs != width {
-        return Err(AgentFileError::Tensor {
-            name: "memory.cell.layers.0.leave.weight".to_owned(),
-            expected: format!("a multiple of the heads, and {inputs} inputs"),
-            given: format!("{inner} for {heads} heads, and {width} inputs"),
-        });
+        return Err(AgentFileError::Heads { heads, channels: inner, width, given: inputs });
     }
     Stack::new(kind, layers, Sizes { width, heads, inner, keys }, |name, shape| weights(tensors, &name, shape))
 }

@@ -70,11 +70,13 @@ export class Agents {
   /** One sentence about the training. */
   trained(id) {
     const { agent, steps, evaluation } = this.description(id);
-    const share = ({ options, success }) => {
+    // Endless environments have no success.
+    const share = ({ options, success, mean_reward: mean }) => {
       const given = Object.entries(options).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`);
-      return `${Math.round(100 * success)} %` + (given.length ? ` with ${given.join(" and ")}` : "");
+      const score = success === undefined ? `its mean return is ${mean.toFixed(2)}` : `it succeeds in ${Math.round(100 * success)} %`;
+      return score + (given.length ? ` with ${given.join(" and ")}` : "");
     };
-    const measured = evaluation.length ? `; it succeeds in ${evaluation.map(share).join(", ")}` : "";
+    const measured = evaluation.map((result) => `; ${share(result)}`).join("");
     return `${KINDS[agent]}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
   }
 }
