@@ -9,7 +9,7 @@ import pytest
 from agents_helpers import changed, settings
 
 from endless_gym import spec
-from endless_gym_agents import enjoy, export, plot, probe, protocol, search
+from endless_gym_agents import checkpoint, enjoy, export, plot, probe, protocol, search
 from endless_gym_agents import train as training
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.logs import read_progress
@@ -65,5 +65,5 @@ def test_the_programs_take_a_memory(
     assert json.loads(capsys.readouterr().out)
     searched = ["--folder", "study", "--trials", "1", "--parameters", "recurrence.layers"]
     assert run(search.main, *searched, *env, *small, "--ppo.updates", "1") == 0
-    assert run(export.main, "runs/one", "--out", "agent.bin") == 1
-    assert "an agent cannot be exported: --agent must be gru" in capsys.readouterr().err
+    assert run(export.main, "runs/one", "--out", "agent.safetensors") == 0
+    assert checkpoint.load(Path("agent.safetensors")).agent.settings.agent == "retnet"
