@@ -320,8 +320,8 @@ impl Network {
         self.decide(pass);
     }
 
-    /// Computes logits and values with another memory, which gets its inputs and returns outputs of the same shape. The network has
-    /// no layers of its own then.
+    /// Computes logits and values with a memory of the caller's, for a network whose `spec.layers` is 0. `memory` gets the outputs of
+    /// the layer before it, and returns as many numbers for the body.
     pub fn forward_with(&self, pass: &mut Pass, memory: impl FnOnce(&[f32]) -> Vec<f32>) {
         self.encode(pass);
         pass.remembered = memory(if self.embedding.is_some() { &pass.embedded } else { &pass.encoded });

@@ -6,8 +6,6 @@
 //! S = a S + k u^T,   y = S^T q        with u = v, or for the gated delta rule with rate b: u = b (v - a S^T k)
 //! ```
 
-use std::ops::Range;
-
 use endless_gym_kernels::functions::sigmoid;
 
 /// Added to the mean square by which vectors are normalised.
@@ -29,10 +27,11 @@ pub enum Kind {
 pub struct Sizes {
     /// Size of the inputs and outputs.
     pub width: usize,
+    /// Number of heads.
     pub heads: usize,
-    /// V of all heads.
+    /// Size of the values of all heads, heads * V.
     pub inner: usize,
-    /// K.
+    /// K, the size of a key.
     pub keys: usize,
 }
 
@@ -44,7 +43,7 @@ pub struct Stack {
     norm: Vec<f32>,
 }
 
-/// Weights of a layer. Those that a kind does not have are empty.
+/// Weights of a layer, with the names of the Python class. Those that a kind does not have are empty.
 struct Layer {
     norm: Vec<f32>,
     enter: Vec<f32>,
@@ -136,10 +135,11 @@ impl Stack {
         normalised(&x, &self.norm)
     }
 
+    /// The outputs of a layer for its normalised inputs, and its state after the step.
     fn layer(&self, layer: &Layer, x: &[f32], state: &mut State) -> Vec<f32> {
         let Sizes { width, heads, inner, keys } = self.sizes;
         let entered = product(&layer.enter, x);
-        // Numbers of all heads: the range of the output gate, that of the inputs of decay or rate, queries, keys and values.
+        // Where the output gate is in `entered`; queries, keys and values of all heads; where the inputs of decays and rates are.
         let (gate, mut q, mut k, mut v, numbers) = match self.kind {
             Kind::GatedDeltaNet => {
                 let convolved = convolution(layer, &entered[..3 * width], &mut state.window);
@@ -159,7 +159,7 @@ impl Stack {
         };
         let mut y = vec![0.0; inner];
         for head in 0..heads {
-            let part = |size: usize| -> Range<usize> { head * size..(head + 1) * size };
+            let part = |size: usize| head * size..(head + 1) * size;
             let (q, k) = (&mut q[part(keys)], &mut k[part(keys)]);
             let (v, y) = (&mut v[part(inner / heads)], &mut y[part(inner / heads)]);
             let s = &mut state.s[part(keys * inner / heads)];
@@ -236,7 +236,7 @@ fn normalised(x: &[f32], weight: &[f32]) -> Vec<f32> {
     x.iter().zip(weight).map(|(x, weight)| x * scale * weight).collect()
 }
 
-/// Divides by the length.
+/// Divides by the length, as `torch.nn.functional.normalize`.
 fn unit(x: &mut [f32]) {
     let length = x.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-12);
     x.iter_mut().for_each(|x| *x /= length);
