@@ -33,8 +33,8 @@ if version != expected or endless_gym.__version__ != expected:
         f"the version must be {expected}, got {version} of the package and {endless_gym.__version__} of the module"
     )
 licences = [file.name for file in importlib.metadata.files("endless-gym") or [] if "licenses" in file.parts]
-if sorted(licences) != ["LICENSE-APACHE", "LICENSE-MIT"]:
-    sys.exit(f"the package must contain both licences, got {licences}")
+if sorted(licences) != ["LICENSE-APACHE", "LICENSE-MIT", "NOTICE"]:
+    sys.exit(f"the package must contain both licences and NOTICE, got {licences}")
 
 with gymnasium.make(f"EndlessGym/{ENV}") as env:
     env.reset(seed=1)

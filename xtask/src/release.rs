@@ -30,7 +30,7 @@ const CRATES: [&str; 12] = [
     "endless-gym-web",
 ];
 
-const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
+const LICENCES: [&str; 3] = ["LICENSE-APACHE", "LICENSE-MIT", "NOTICE"];
 
 /// Builds and checks all files.
 pub fn build() -> Result<(), String> {
