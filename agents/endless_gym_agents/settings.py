@@ -192,7 +192,7 @@ class PPO:
 
 @dataclass(frozen=True)
 class Settings:
-    """Train an agent with PPO on one of the Memory Gym environments."""
+    """Train an agent with PPO on an environment of Memory Gym or POPGym, or one of your own."""
 
     env: str = DEFAULT_ENV_ID
     """environment id; `endless list` lists them"""
@@ -211,9 +211,9 @@ class Settings:
     """arguments of the class of an encoder of your own, as for `agent-option`"""
     preset: PresetName = "paper"
     """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
-    overnight: those of the paper for 8.2 million steps, as many as the first checkpoint of its curves; for a laptop's night:
-    12 hours on one core; throughput: many environments and short rollouts, with gradients through 32 steps instead of the
-    paper's 512; throughput-512: many environments with the paper's 512 steps;
+    overnight: those of the paper for 8.2 million steps, as many as the first point of its curves; throughput: many environments
+    and short rollouts, with gradients through 32 steps instead of the paper's 512; throughput-512: many environments with the
+    paper's 512 steps;
     quick: small networks and feature observations; takes minutes on two CPU cores, and stops when the task is learnt"""
     seed: Natural = 1
     """seed of the initial weights, the episode seeds and all sampling"""
