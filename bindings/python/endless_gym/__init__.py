@@ -1,4 +1,4 @@
-"""Endless Gym: the Memory Gym environments, bit-exact to the original, in lockstep and in shared memory.
+"""Endless Gym: the environments of Memory Gym and POPGym, bit-exact to the originals, in lockstep and in shared memory.
 
 ```python
 import endless_gym, gymnasium

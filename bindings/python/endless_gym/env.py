@@ -22,10 +22,10 @@ Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 @documented(spec for spec in all_specs().values() if spec.frame)
 class Env(gymnasium.Env[Any, Any]):
-    """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
+    """An environment of Memory Gym or POPGym, bit-exact to the original, or one of `register_envs`.
 
-    Observations are uint8 (84, 84, 3), indexed `[x][y][channel]` as in the original; the ids with `MortarMayhemB` return a dict
-    of `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
+    Observations of Memory Gym are uint8 (84, 84, 3), indexed `[x][y][channel]` as in the original; the ids with `MortarMayhemB`
+    return a dict of `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
     `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` contain the meanings of the numbers.
 
@@ -137,7 +137,8 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), self._info(arrays)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Play one step. As in the original, `terminated` reports every end of an episode of Memory Gym, also by the step limit.
+        """Play one step. As in the originals, `terminated` reports every end of an episode of Memory Gym, also by the step limit,
+        and `truncated` the time limits of POPGym.
 
         Raises:
             ResetNeeded: The environment has not been reset.

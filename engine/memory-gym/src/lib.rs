@@ -1,4 +1,4 @@
-//! The environments of Memory Gym (Pleines et al., JMLR 2025), bit for bit as the Python package `memory-gym` 1.0.2 plays them.
+//! The environments of Memory Gym (Pleines et al., JMLR 2025), bit for bit as `memory-gym` 1.0.3 plays them.
 //!
 //! Each family is a module: [`mortar_mayhem`], [`mystery_path`], [`searing_spotlights`], with its ids in `IDS`. What pools and programs
 //! use is [`memory_gym`]; the rules are public for benchmarks and may change in any version.
