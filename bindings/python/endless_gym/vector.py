@@ -174,7 +174,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             observation: (n, ...) with the shape and dtype of `observation_space`; uint8 (n, 84, 84, 3) by default, or a dict of
                 such arrays.
             reward: float64 (n,).
-            terminated: bool (n,). As in the original, it is set at every end of an episode of Memory Gym, including the step limit.
+            terminated: bool (n,). As in the original, it is set at every end of an episode of Memory Gym, also by the step limit.
             truncated: bool (n,). Set at the time limits of POPGym.
             info: Arrays with their masks, as the class describes.
 
