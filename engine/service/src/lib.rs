@@ -99,6 +99,7 @@ mod namespace {
     pub(crate) mod descriptors;
     pub(crate) mod directory;
     pub(crate) mod fork_guard;
+    pub(crate) mod iceoryx_files;
     pub(crate) mod identity;
     pub(crate) mod lock;
     pub(crate) mod locked_file;

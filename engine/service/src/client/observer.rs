@@ -1,13 +1,12 @@
 //! The observer: reads a group's batches in addition to the trainer.
 
 use std::fs::File;
-use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::MetadataExt;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::BLOCK_BYTES;
-use iceoryx2::prelude::{CallbackProgression, PortFactory, SemanticString};
+use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use rustix::fs::FallocateFlags;
 use rustix::io::Errno;
 
@@ -15,8 +14,8 @@ use crate::client::connect::{ConnectConfig, connect_to_engine};
 use crate::client::lease::{BatchLease, Response, ResponsePort, ResponseService};
 use crate::client::status;
 use crate::error::ServiceError;
+use crate::namespace::iceoryx_files::data_segment;
 use crate::namespace::node::NamespaceNode;
-use crate::namespace::segments::DIRECTORY;
 use crate::namespace::{descriptors, memory};
 use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
 use crate::protocol::specification::ServiceSpecification;
@@ -396,7 +395,9 @@ pub(crate) fn reserve_for_observer(
         CallbackProgression::Stop
     });
     let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
-    let Some(segment) = publisher.and_then(|publisher| segment(services, publisher)) else { return Err(restarted()) };
+    let segment = publisher.and_then(|publisher| data_segment(publisher, services.node.config()));
+    let segment =
+        segment.and_then(|path| File::options().read(true).write(true).open(path).ok()).ok_or_else(restarted)?;
 
     let unused = limits.observer_chunks() * (specification.observers - observers);
     let chunk = (chunk_blocks(&specification.batch) * BLOCK_BYTES) as u64;
@@ -412,13 +413,4 @@ pub(crate) fn reserve_for_observer(
         Err(Errno::OPNOTSUPP | Errno::NOSYS) => memory::check_free(chunk * limits.observer_chunks() as u64),
         Err(e) => Err(failed(e.into())),
     }
-}
-
-/// The data segment of the engine's publisher. Its name ends with the publisher's id.
-fn segment(services: &EngineServices<'_>, publisher: u128) -> Option<File> {
-    let global = &services.node.config().global;
-    let suffix = format!("_{publisher}{}", global.service.data_segment_suffix);
-    let is_segment = |name: &[u8]| name.starts_with(global.prefix.as_bytes()) && name.ends_with(suffix.as_bytes());
-    let found = std::fs::read_dir(DIRECTORY).ok()?.flatten().find(|entry| is_segment(entry.file_name().as_bytes()))?;
-    File::options().read(true).write(true).open(found.path()).ok()
 }

@@ -14,22 +14,20 @@
 //! that prove that no living process is creating what it removes.
 
 use std::collections::HashSet;
-use std::ffi::OsStr;
-use std::fs::{self, Metadata};
+use std::fs;
 use std::io::ErrorKind;
-use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use iceoryx2::node::NodeView;
-use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, SemanticString};
+use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState};
 use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
 
 use crate::error::ServiceError;
 use crate::namespace::directory::Ipc;
+use crate::namespace::iceoryx_files as files;
 use crate::namespace::identity::ExclusiveCreation;
 use crate::namespace::lock::NamespaceLock;
-use crate::namespace::segments::DIRECTORY;
 
 /// Whether the namespace has an unsized segment.
 pub(crate) fn has_unsized_segments(config: &Config) -> bool {
@@ -42,28 +40,23 @@ pub(crate) fn remove_unsized_segments(config: &Config, _lock: &NamespaceLock, _a
 }
 
 fn unsized_segments(config: &Config) -> impl Iterator<Item = PathBuf> {
-    segments(config).filter(|path| metadata(path).is_some_and(|data| data.len() == 0))
-}
-
-fn segments(config: &Config) -> impl Iterator<Item = PathBuf> {
-    let prefix = config.global.prefix;
-    entries(Path::new(DIRECTORY)).into_iter().filter(move |path| is_named(path, prefix.as_bytes()))
+    files::segments(config).filter(|path| files::is_unsized(path))
 }
 
 /// A segment of the namespace that belongs to another user, and that user.
 pub(crate) fn foreign_segment(config: &Config) -> Option<(PathBuf, u32)> {
     let user = rustix::process::getuid().as_raw();
-    segments(config).find_map(|path| {
-        let owner = metadata(&path)?.uid();
+    files::segments(config).find_map(|path| {
+        let owner = fs::symlink_metadata(&path).ok()?.uid();
         (owner != user).then_some((path, owner))
     })
 }
 
-/// Removes the node counter. iceoryx2 needs it only while it creates a node, under the lock, and recreates it if it is
-/// missing; node ids stay unique, since they also contain the process id and the start time. The counter is writable by
-/// all users, and one left by a process that died halfway is unusable, so it is kept only while a node is created.
+/// Removes the node counter, which is needed only while a node is created, under the lock; node ids stay unique, since they
+/// also contain the process id and the start time. The counter is writable by all users, and one left by a process that
+/// died halfway is unusable, so it is kept only while a node is created.
 pub(crate) fn remove_counter(config: &Config, _lock: &NamespaceLock) -> Result<(), ServiceError> {
-    for path in segments(config).filter(|path| path.as_os_str().as_bytes().ends_with(b".global_mgmt")) {
+    for path in files::segments(config).filter(|path| files::is_node_counter(path)) {
         match fs::remove_file(&path) {
             Err(e) if e.kind() != ErrorKind::NotFound => {
                 let failed = ServiceError::middleware("cannot remove the counter of nodes");
@@ -77,12 +70,7 @@ pub(crate) fn remove_counter(config: &Config, _lock: &NamespaceLock) -> Result<(
 
 /// Removes incomplete services, which block their names.
 pub(crate) fn remove_incomplete_services(config: &Config, _lock: &NamespaceLock, _all: &ExclusiveCreation) {
-    for path in entries(&directory(&config.global.service_dir())) {
-        // iceoryx2 makes a static configuration read-only when it is finished.
-        if metadata(&path).is_some_and(|data| data.permissions().mode() & 0o200 != 0) {
-            remove(&path);
-        }
-    }
+    files::services(config).filter(|path| files::is_unfinished_service(path)).for_each(|path| remove(&path));
 }
 
 /// Removes incomplete nodes.
@@ -102,8 +90,8 @@ pub(crate) fn remove_incomplete_nodes(config: &Config, _lock: &NamespaceLock) {
     if listed.is_err() {
         return;
     }
-    for path in entries(&directory(&config.global.node_dir())) {
-        let number = node_number(&path, config.global.prefix.as_bytes());
+    for path in files::entries(&files::node_directory(config)) {
+        let number = files::node_number(&path, config);
         if number.is_some_and(|number| !complete.contains(&number)) {
             remove(&path);
         }
@@ -122,15 +110,14 @@ pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock, _all: &Excl
     }
     remove_files(config);
     // Directories that are not empty stay.
-    let _ =
-        (fs::remove_dir(directory(&config.global.service_dir())), fs::remove_dir(directory(&config.global.node_dir())));
+    let _ = (fs::remove_dir(files::service_directory(config)), fs::remove_dir(files::node_directory(config)));
     true
 }
 
 /// Removes everything. The caller knows that no process uses the namespace.
 pub(crate) fn remove_all(config: &Config, _lock: &NamespaceLock) {
     remove_files(config);
-    for directory in [directory(&config.global.service_dir()), directory(&config.global.node_dir())] {
+    for directory in [files::service_directory(config), files::node_directory(config)] {
         if directory.exists() {
             remove(&directory);
         }
@@ -139,50 +126,22 @@ pub(crate) fn remove_all(config: &Config, _lock: &NamespaceLock) {
 
 /// Removes the segments, the sockets and the services.
 fn remove_files(config: &Config) {
-    let (root, services) = (directory(config.global.root_path()), directory(&config.global.service_dir()));
-    let prefix = config.global.prefix.as_bytes();
-    let files = [&root, &services].into_iter().flat_map(|directory| entries(directory));
-    files.filter(|path| is_named(path, prefix)).chain(segments(config)).for_each(|path| remove(&path));
+    let all = files::root_files(config).chain(files::services(config)).chain(files::segments(config));
+    all.for_each(|path| remove(&path));
 }
 
 /// Sets the times of all files in the namespace's directory to now.
 pub(crate) fn refresh(config: &Config) {
     let now = Timespec { tv_sec: 0, tv_nsec: UTIME_NOW };
     let now = Timestamps { last_access: now, last_modification: now };
-    let (services, nodes) = (directory(&config.global.service_dir()), directory(&config.global.node_dir()));
-    let of_nodes = entries(&nodes).into_iter().flat_map(|path| entries(&path));
-    let all =
-        [directory(config.global.root_path()), services, nodes.clone()].into_iter().flat_map(|path| entries(&path));
-    for path in all.chain(of_nodes) {
+    let nodes = files::node_directory(config);
+    let of_nodes = files::entries(&nodes).flat_map(|path| files::entries(&path));
+    let all = [files::root_directory(config), files::service_directory(config), nodes.clone()];
+    for path in all.iter().flat_map(|path| files::entries(path)).chain(of_nodes) {
         if let Err(e) = utimensat(CWD, &path, &now, AtFlags::SYMLINK_NOFOLLOW) {
             tracing::debug!(error = %e, path = %path.display(), "cannot set the times of a file");
         }
     }
-}
-
-/// The number of the node that a file or directory belongs to, from its name: `NUMBER`, or the prefix, `NUMBER` and
-/// `.node_monitor...`.
-fn node_number(path: &Path, prefix: &[u8]) -> Option<String> {
-    let name = path.file_name()?.as_bytes();
-    let name = std::str::from_utf8(name.strip_prefix(prefix).unwrap_or(name)).ok()?;
-    let number = name.split('.').next()?;
-    (!number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit())).then(|| number.to_owned())
-}
-
-fn directory(path: &iceoryx2::prelude::Path) -> PathBuf {
-    PathBuf::from(OsStr::from_bytes(path.as_bytes()))
-}
-
-fn entries(directory: &Path) -> Vec<PathBuf> {
-    fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path()).collect()
-}
-
-fn is_named(path: &Path, prefix: &[u8]) -> bool {
-    path.file_name().is_some_and(|name| name.as_bytes().starts_with(prefix))
-}
-
-fn metadata(path: &Path) -> Option<Metadata> {
-    fs::symlink_metadata(path).ok()
 }
 
 fn remove(path: &Path) {
@@ -194,11 +153,13 @@ fn remove(path: &Path) {
 #[cfg(test)]
 mod tests {
     use std::fs::{File, Permissions};
+    use std::os::unix::fs::PermissionsExt;
     use std::time::SystemTime;
 
     use super::*;
     use crate::namespace::directory::Namespace;
     use crate::namespace::identity::Identity;
+    use crate::namespace::segments::DIRECTORY;
 
     /// A new namespace without nodes.
     fn empty_namespace(name: &str) -> (Namespace, Config, Identity, NamespaceLock) {
@@ -217,16 +178,6 @@ mod tests {
         File::create(&path).unwrap();
         fs::set_permissions(&path, Permissions::from_mode(mode)).unwrap();
         path
-    }
-
-    #[test]
-    fn files_of_nodes_are_recognised() {
-        let number = |name: &str| node_number(&Path::new("/tmp").join(name), b"e1_");
-        assert_eq!(number("123").as_deref(), Some("123"));
-        assert_eq!(number("e1_123.node_monitor_owner_lock").as_deref(), Some("123"));
-        assert_eq!(number("e2_123.node_monitor"), None);
-        assert_eq!(number("e1_.node_monitor"), None);
-        assert_eq!(number("notes.txt"), None);
     }
 
     /// All files are new: removal does not depend on their age.
@@ -248,7 +199,7 @@ mod tests {
         let all = identity.try_exclusive(&lock).unwrap();
         File::options().write(true).open(&begun).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
         refresh(&config);
-        assert!(metadata(&begun).unwrap().modified().unwrap() > SystemTime::UNIX_EPOCH);
+        assert!(fs::metadata(&begun).unwrap().modified().unwrap() > SystemTime::UNIX_EPOCH);
         remove_counter(&config, &lock).unwrap();
         assert!(empty.exists() && !counter.exists());
         remove_unsized_segments(&config, &lock, &all);

@@ -10,6 +10,7 @@ use iceoryx2::prelude::{Config, FileName, Path as IceoryxPath, SemanticString, i
 use serde::{Deserialize, Serialize};
 
 use crate::error::ServiceError;
+use crate::namespace::iceoryx_files::MAX_SOCKET_NAME;
 
 /// The iceoryx2 service type. Its ports and samples may be moved to and dropped in any thread, as bindings to a
 /// garbage-collected language require. Compared with the single-threaded type, it costs half a microsecond per step.
@@ -21,9 +22,9 @@ pub const ROOT_VARIABLE: &str = "ENDLESS_GYM_ROOT";
 /// Maximum length of an engine name in bytes.
 const MAX_SERVICE_NAME: usize = 64;
 
-/// Maximum length of the root in bytes. The path of a Unix socket has at most 107 bytes: the root, a separator, the prefix (at
-/// most [`MAX_PREFIX`] bytes) and 49 bytes of the socket's own name.
-const MAX_ROOT: usize = 107 - 1 - MAX_PREFIX - 49;
+/// Maximum length of the root in bytes. The path of a Unix socket has at most 107 bytes: the root, a separator, the prefix and the
+/// socket's own name.
+const MAX_ROOT: usize = 107 - 1 - MAX_PREFIX - MAX_SOCKET_NAME;
 /// Length in bytes of the prefix of all sockets and segments: [`Namespace::prefix`], random characters, `_`.
 pub(crate) const MAX_PREFIX: usize = 16;
 

@@ -1,17 +1,14 @@
 //! The iceoryx2 node of this process in a namespace, and the state of other processes' nodes.
 
-use std::ffi::OsStr;
 use std::fs;
 use std::ops::Deref;
-use std::os::unix::ffi::OsStrExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::node::{DeadNodeView, NodeDetails, NodeView};
 use iceoryx2::prelude::{
-    CallbackProgression, Config, LogLevel, Node, NodeBuilder, NodeState, SemanticString, SignalHandlingMode,
-    set_log_level_from_env_or,
+    CallbackProgression, Config, LogLevel, Node, NodeBuilder, NodeState, SignalHandlingMode, set_log_level_from_env_or,
 };
 
 use crate::error::ServiceError;
@@ -20,7 +17,7 @@ use crate::namespace::fork_guard::ForkGuard;
 use crate::namespace::identity::{CreationLock, Identity};
 use crate::namespace::lock::{LOCK_TIMEOUT, NamespaceLock};
 use crate::namespace::members::{self, Membership};
-use crate::namespace::{cleanup, descriptors, memory, process, segments};
+use crate::namespace::{cleanup, descriptors, iceoryx_files, memory, process, segments};
 
 /// How many times a process tries to join a namespace whose directory is removed meanwhile.
 const JOIN_ATTEMPTS: usize = 5;
@@ -107,7 +104,7 @@ impl NamespaceNode {
     /// Fails if the namespace's directory, or this process's file in it, was removed or replaced since this process joined.
     pub(crate) fn check_root(&self) -> Result<(), ServiceError> {
         self.identity.check()?;
-        if self.context_file(self.id()).exists() {
+        if iceoryx_files::context_file(self.id(), self.config()).exists() {
             Ok(())
         } else {
             Err(ServiceError::RootRemoved { path: self.root.clone() })
@@ -198,17 +195,10 @@ impl NamespaceNode {
         let Some(pid) = details.and_then(|details| u32::try_from(details.process_id().value()).ok()) else {
             return false;
         };
-        let number = |node: &UniqueNodeId| fs::read(self.context_file(node)).ok();
+        let number = |node: &UniqueNodeId| fs::read(iceoryx_files::context_file(node, self.config())).ok();
         pid != std::process::id()
             && number(&node).is_some_and(|number_of| Some(number_of) == number(self.id()))
             && !process::runs(pid)
-    }
-
-    /// The file with the number by which iceoryx2 identifies the process of a node.
-    fn context_file(&self, node: &UniqueNodeId) -> PathBuf {
-        let global = &self.config().global;
-        let name = format!("{}{}{}_context", global.prefix, node.value(), global.node.monitor_suffix);
-        Path::new(OsStr::from_bytes(global.node_dir().as_bytes())).join(name)
     }
 
     /// The process id of the owner of a running node.
