@@ -217,6 +217,9 @@ pub(crate) fn read_text(payload: &[Block], bytes: usize) -> String {
 }
 
 #[cfg(test)]
+mod layout_tests;
+
+#[cfg(test)]
 mod tests {
     use endless_gym_core::batch::zeroed;
 
