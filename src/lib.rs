@@ -10,13 +10,20 @@
 //!   `endless-gym-core`, which needs no operating system services and builds for WebAssembly.
 //! - [`service`]: an engine, its trainer and observers, as processes that share memory. This is `endless-gym-service`.
 //!
+//! Each suite, `service` and `program` is a feature of that name, and all are on by default. A trainer needs only `service`, a
+//! third of the dependencies:
+//!
+//! ```toml
+//! endless-gym = { version = "0.1", default-features = false, features = ["service"] }
+//! ```
+//!
 //! The program `endless` is `endless-gym-cli`; [`program`] runs it. Other exports of these crates (sprites and dirty
 //! rectangles, the rules of single environments) exist for the project's tests and benchmarks and may change in any
 //! version.
 
-use std::sync::LazyLock;
-
+#[cfg(feature = "memory-gym")]
 pub use endless_gym_memory_gym::{DEFAULT_ENV_ID, memory_gym};
+#[cfg(feature = "popgym")]
 pub use endless_gym_popgym::popgym;
 
 /// The registry of the program `endless`: the ids of [`memory_gym`], then those of [`popgym`].
@@ -24,7 +31,10 @@ pub use endless_gym_popgym::popgym;
 /// ```
 /// assert_eq!(endless_gym::environments().specs().count(), 58);
 /// ```
+#[cfg(all(feature = "memory-gym", feature = "popgym"))]
 pub fn environments() -> &'static pool::Registry {
+    use std::sync::LazyLock;
+
     static REGISTRY: LazyLock<pool::Registry> =
         LazyLock::new(|| endless_gym_popgym::register(memory_gym().clone()).expect("the suites have different ids"));
     &REGISTRY
@@ -38,7 +48,7 @@ pub fn environments() -> &'static pool::Registry {
 ///     endless_gym::program(endless_gym::memory_gym())
 /// }
 /// ```
-#[cfg(not(target_arch = "wasm32"))]
+#[cfg(all(feature = "program", not(target_arch = "wasm32")))]
 pub fn program(registry: &pool::Registry) -> std::process::ExitCode {
     use std::io::Write;
 
@@ -96,7 +106,7 @@ pub mod raster {
 }
 
 /// Engines that serve environments in shared memory, their trainers and observers.
-#[cfg(not(target_arch = "wasm32"))]
+#[cfg(all(feature = "service", not(target_arch = "wasm32")))]
 pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Drawn, Engine,

@@ -21,8 +21,12 @@ pub fn format() -> Result<(), String> {
 
 pub fn clippy() -> Result<(), String> {
     cargo(&["clippy", "--workspace", "--all-targets", "--locked", "--", "--deny", "warnings"])?;
-    let core = ["--package", "endless-gym-core", "--no-default-features", "--locked"];
-    cargo(&[&["clippy"], core.as_slice(), &["--", "--deny", "warnings"]].concat())
+    for features in [["endless-gym-core", ""], ["endless-gym", ""], ["endless-gym", "service"]] {
+        let [package, features] = features;
+        let selection = ["clippy", "--locked", "--package", package, "--no-default-features", "--features", features];
+        cargo(&[&selection, ["--", "--deny", "warnings"].as_slice()].concat())?;
+    }
+    Ok(())
 }
 
 /// All tests of the workspace that are not ignored.
