@@ -1,12 +1,15 @@
 """Endless Gym: the environments of Memory Gym and POPGym, bit-exact to the originals, in lockstep and in shared memory.
 
-```python
-import endless_gym, gymnasium
-
-env = gymnasium.make("EndlessGym/MortarMayhem-v0")                        # one environment
-envs = gymnasium.make_vec("EndlessGym/MortarMayhem-v0", num_envs=1024)    # a vector environment in this process
-envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # a vector environment in an engine process
-```
+>>> import endless_gym, gymnasium
+>>> gymnasium.make("EndlessGym/MortarMayhem-v0").observation_space  # one environment
+Box(0, 255, (84, 84, 3), uint8)
+>>> envs = endless_gym.make_vec("MortarMayhem-v0", num_envs=64)  # a vector environment in this process
+>>> envs.observation_space.shape
+(64, 84, 84, 3)
+>>> with endless_gym.serve("MortarMayhem-v0", num_envs=64) as envs:  # a vector environment in an engine process
+...     observation, info = envs.reset(seed=0)
+>>> observation.flags.writeable  # a view of shared memory
+False
 """
 
 import sys

@@ -49,6 +49,13 @@ def make_vec(
 ) -> EndlessVectorEnv:
     """Create environments in this process.
 
+    Examples:
+        >>> import endless_gym
+        >>> envs = endless_gym.make_vec("MysteryPath-Grid-v0", num_envs=4, seed=0)
+        >>> observation, info = envs.reset()
+        >>> observation.shape, observation.dtype, envs.action_space
+        ((4, 84, 84, 3), dtype('uint8'), MultiDiscrete([4 4 4 4]))
+
     Args:
         id: Environment id, such as `Endless-MortarMayhem-v0`.
         num_envs: Environments in each group.

@@ -145,12 +145,12 @@ def serve(
     """Start an engine in a child process, and connect to it. It stops when the environments are closed or no longer referenced,
     or when this process ends.
 
-    ```python
-    import endless_gym
-
-    with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=256, groups=2) as envs:
-        observation, info = envs.reset()
-    ```
+    Examples:
+        >>> import endless_gym
+        >>> with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=16, groups=2, seed=0) as envs:
+        ...     observation, info = envs.reset()
+        >>> observation.shape, envs.num_groups
+        ((16, 84, 84, 3), 2)
 
     Args:
         id: Environment id, such as `Endless-MortarMayhem-v0`.

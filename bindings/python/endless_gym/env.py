@@ -35,6 +35,13 @@ class Env(gymnasium.Env[Any, Any]):
     `copy.deepcopy` and `pickle` make an independent environment that continues identically: they copy the state of the episode
     and of the generator, but no window.
 
+    Examples:
+        >>> import endless_gym
+        >>> env = endless_gym.Env("MortarMayhem-Grid-v0", options={"command_count": [1]})
+        >>> observation, info = env.reset(seed=1)
+        >>> observation.shape, observation.dtype, env.action_space
+        ((84, 84, 3), dtype('uint8'), Discrete(4))
+
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
         render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
@@ -114,6 +121,12 @@ class Env(gymnasium.Env[Any, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode.
 
+        Examples:
+            >>> env = Env("MysteryPath-Grid-v0")
+            >>> observation, info = env.reset(seed=1, options={"show_goal": True})
+            >>> env.reset_params["show_goal"], env.max_episode_steps
+            (True, 128)
+
         Args:
             seed: Seed of the environment's generator, passed to `numpy.random.default_rng`. `None` continues the generator.
             options: Reset parameters by the original's names, which override those given to the constructor.
@@ -139,6 +152,15 @@ class Env(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Play one step. As in the originals, `terminated` reports every end of an episode of Memory Gym, also by the step limit,
         and `truncated` the time limits of POPGym.
+
+        Examples:
+            >>> env = Env("MortarMayhem-Grid-v0", options={"command_count": [1]})
+            >>> observation, info = env.reset(seed=1)
+            >>> terminated = False
+            >>> while not terminated:
+            ...     observation, reward, terminated, truncated, info = env.step(0)
+            >>> reward, info
+            (0.0, {'reward': 0.0, 'length': 10, 'success': 1, 'commands_completed': 1.0})
 
         Raises:
             ResetNeeded: The environment has not been reset.

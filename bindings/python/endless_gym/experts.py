@@ -16,19 +16,20 @@ from endless_gym.specs import Spec, spec
 class Experts:
     """One scripted expert for each of n environments. It reads the features and remembers what an agent must remember.
 
-    ```python
-    import endless_gym
-    import numpy as np
-
-    envs = endless_gym.make_vec("MortarMayhem-v0", 8, observation="features")
-    experts = endless_gym.Experts("MortarMayhem-v0", 8)
-    observation, info = envs.reset(seed=0)
-    episode_start, ended = np.ones(8, dtype=bool), np.zeros(8, dtype=bool)
-    for _ in range(100):
-        observation, reward, terminated, truncated, info = envs.step(experts.act(observation, episode_start))
-        # With next-step auto-reset, the step after the end of an episode returns the first observation of the next one.
-        episode_start, ended = ended, terminated | truncated
-    ```
+    Examples:
+        >>> import endless_gym
+        >>> import numpy as np
+        >>> envs = endless_gym.make_vec("MysteryPath-Grid-v0", 8, observation="features", autoreset="same_step", seed=0)
+        >>> experts = endless_gym.Experts("MysteryPath-Grid-v0", 8)
+        >>> observation, info = envs.reset()
+        >>> is_first = np.ones(8, dtype=bool)
+        >>> rewards = np.zeros(8)
+        >>> for _ in range(100):
+        ...     observation, reward, terminated, truncated, info = envs.step(experts.act(observation, is_first))
+        ...     is_first = terminated | truncated
+        ...     rewards += reward
+        >>> bool((rewards >= 1).all())  # each of them has found a goal
+        True
 
     Args:
         id: Environment id, such as `Endless-MortarMayhem-v0`.

@@ -36,13 +36,12 @@ def replay(
 ) -> Iterator[ReplayStep]:
     """Play an episode again, exactly.
 
-    ```python
-    import endless_gym
-
-    actions = [[0, 0]] * 40  # those of the episode
-    steps = endless_gym.replay("MortarMayhem-v0", seed=7, options={"command_count": [2]}, actions=actions)
-    print(sum(step.reward for step in steps))
-    ```
+    Examples:
+        >>> import endless_gym
+        >>> actions = [[0, 0]] * 22
+        >>> steps = list(endless_gym.replay("MortarMayhem-v0", seed=7, options={"command_count": [1]}, actions=actions))
+        >>> len(steps), steps[-1].terminated, steps[-1].info["length"]
+        (23, True, 22)
 
     Args:
         id: Environment id.

@@ -37,6 +37,12 @@ class Frames:
     """The format of the frames of an observation. The default is the original's: uint8 (84, 84, 3), indexed `[x][y][channel]`.
 
     The engine writes this format directly, without a conversion, and only the pixels that change.
+
+    Examples:
+        >>> import endless_gym
+        >>> envs = endless_gym.make_vec("MysteryPath-v0", 8, frames=endless_gym.Frames(grayscale=True, stack=4))
+        >>> envs.observation_space.shape
+        (8, 4, 84, 84)
     """
 
     #: Grayscale without a channel axis, like Gymnasium's `GrayscaleObservation`.
@@ -222,7 +228,13 @@ _SPECS: dict[str, Spec] = {}
 
 
 def all_specs() -> dict[str, Spec]:
-    """All environments by their ids."""
+    """All environments by their ids.
+
+    Examples:
+        >>> import endless_gym
+        >>> endless_gym.all_specs()["MysteryPath-v0"].summary
+        'Find an invisible path to the goal; the agent starts over after a fall and must remember the path'
+    """
     return _SPECS
 
 
@@ -247,6 +259,14 @@ def add_specs(native: ModuleType) -> Iterable[Spec]:
 def spec(id: str) -> Spec:
     """The specification of an id, with or without the prefix `EndlessGym/`. As for `gymnasium.make`, `module:id` imports a module
     first, which registers the id.
+
+    Examples:
+        >>> import endless_gym
+        >>> described = endless_gym.spec("MysteryPath-Grid-v0")
+        >>> [choice.name for choice in described.actions[0].choices]
+        ['nothing', 'left', 'right', 'ahead']
+        >>> described.reset_parameters["max_steps"]
+        128
 
     Raises:
         TypeError: The id is not a string.

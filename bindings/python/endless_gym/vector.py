@@ -131,6 +131,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
+        Examples:
+            >>> import endless_gym
+            >>> envs = endless_gym.make_vec("MortarMayhem-Grid-v0", 3)
+            >>> observation, info = envs.reset(seed=0, options={"command_count": [2]})
+            >>> [episode.seed for episode in envs.running_episodes()]
+            [0, 1, 2]
+
         Args:
             seed: Environment `i` of group `g` is seeded with `seed + first_env + g * num_envs + i`. Or a list or an array with a
                 seed or `None` for each environment of a group, or of all groups. This seed alone determines later episodes.
@@ -165,6 +172,17 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def step(self, actions: Any) -> Step:
         """Play one step of every environment.
+
+        Examples:
+            >>> import endless_gym
+            >>> envs = endless_gym.make_vec("MortarMayhem-Grid-v0", 3, seed=0, options={"command_count": [1]})
+            >>> observation, info = envs.reset()
+            >>> for _ in range(10):
+            ...     observation, reward, terminated, truncated, info = envs.step([0, 0, 0])
+            >>> observation.shape, terminated
+            ((3, 84, 84, 3), array([ True,  True,  True]))
+            >>> info["length"], info["_length"]
+            (array([10, 10, 10], dtype=int32), array([ True,  True,  True]))
 
         Args:
             actions: Integers in the shape of `action_space`, as an array or a list: (n,) for Discrete, (n, branches) for
@@ -314,6 +332,15 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
         """The complete state of one environment, which `restore` accepts for any environment of the same id.
+
+        Examples:
+            >>> import endless_gym
+            >>> envs = endless_gym.make_vec("MysteryPath-Grid-v0", 4, seed=0)
+            >>> observation, info = envs.reset()
+            >>> start = envs.snapshot(env=0)
+            >>> observation, info = envs.restore({1: start, 2: start, 3: start})
+            >>> bool((observation == observation[0]).all())
+            True
 
         Raises:
             ValueError: There is no such environment or group.
