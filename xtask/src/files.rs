@@ -1,4 +1,4 @@
-//! Checks the files that no compiler reads: workflows, forms, scripts, licences, and repeated versions.
+//! Checks what no compiler reads: workflows, forms, scripts, licences, repeated versions, and subjects of commits.
 
 use std::path::Path;
 use std::process::Command;
@@ -24,6 +24,7 @@ const SCHEMAS: [(&str, &[&str]); 6] = [
 /// Fails if one of the files is invalid, or a version differs from `Cargo.toml`.
 pub fn check() -> Result<(), String> {
     versions()?;
+    subjects()?;
     let bin = python::tools("files", &python::base()?, &TOOLS)?.join("bin");
     let tool = |name: &str| {
         let mut tool = Command::new(bin.join(name));
@@ -44,6 +45,19 @@ pub fn check() -> Result<(), String> {
         return Ok(());
     }
     run(Command::new("cargo-deny").current_dir(workspace()).args(deny))
+}
+
+/// Checks the subjects of the commits since CONTRIBUTING.md defines them, as far as the clone has them.
+fn subjects() -> Result<(), String> {
+    let log = ["log", "--no-merges", "--since", "2026-11-28T00:00:00Z", "--format=%s"];
+    let subjects = output(Command::new("git").current_dir(workspace()).args(log))?;
+    let is_right = |subject: &str| subject.contains(": ") && subject.chars().count() <= 72;
+    match subjects.lines().find(|subject| !is_right(subject)) {
+        None => Ok(()),
+        Some(subject) => {
+            Err(format!("a commit's subject must be `scope: imperative`, at most 72 characters, got `{subject}`"))
+        }
+    }
 }
 
 /// Checks that the version, the oldest Rust and maturin are the same wherever they are repeated.
