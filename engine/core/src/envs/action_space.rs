@@ -92,14 +92,24 @@ impl ActionSpace {
         if Some(actions.len()) != num_envs.checked_mul(width) {
             return Err(ActionError::Count { given: actions.len(), num_envs, width });
         }
-        let branches = self.branches();
-        let fits = |action: &[i32]| match self {
-            ActionSpace::Box { .. } => box_action(action).iter().all(|number| !number.is_nan()),
-            _ => action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a)),
-        };
-        match actions.chunks_exact(width.max(1)).enumerate().find(|(_, action)| !fits(action)) {
+        if self.contains(actions) {
+            return Ok(());
+        }
+        match actions.chunks_exact(width.max(1)).enumerate().find(|(_, action)| !self.contains(action)) {
             None => Ok(()),
             Some((env, action)) => Err(ActionError::Range { env, given: self.shown(action), space: self.to_string() }),
+        }
+    }
+
+    /// Whether rows of [`width`](ActionSpace::width) numbers are all in the space. Tests every number, so that it compiles to vector
+    /// instructions: a pool's other threads wait for it.
+    fn contains(&self, actions: &[i32]) -> bool {
+        let fits = |action: &i32, choices: &i32| (0..*choices).contains(action);
+        match self.branches() {
+            [] => box_action(actions).iter().fold(true, |all, number| all & !number.is_nan()),
+            [n] => actions.iter().fold(true, |all, a| all & fits(a, n)),
+            [m, n] => actions.as_chunks().0.iter().fold(true, |all, [a, b]| all & fits(a, m) & fits(b, n)),
+            branches => actions.chunks_exact(branches.len()).all(|a| a.iter().zip(branches).all(|(a, n)| fits(a, n))),
         }
     }
 
@@ -272,6 +282,19 @@ mod tests {
         for (env, wrong) in [(0, [-1, 0]), (1, [0, 4]), (1, [3, i32::MIN])] {
             let error = space.check(2, &wrong).unwrap_err();
             assert!(matches!(error, ActionError::Range { env: found, .. } if found == env), "{error}");
+        }
+        for branches in [&[3] as &[i32], &[3, 2], &[3, 2, 4]] {
+            let (space, width) = (ActionSpace::MultiDiscrete(branches.into()), branches.len());
+            let highest: Vec<i32> = branches.iter().map(|choices| choices - 1).cycle().take(40 * width).collect();
+            assert_eq!(space.check(40, &highest), Ok(()));
+            for place in 0..highest.len() {
+                for wrong in [branches[place % width], -1, i32::MIN] {
+                    let mut actions = highest.clone();
+                    actions[place] = wrong;
+                    let error = space.check(40, &actions).unwrap_err();
+                    assert!(matches!(error, ActionError::Range { env, .. } if env == place / width), "{error}");
+                }
+            }
         }
         let space = ActionSpace::bounded(&[-2.0, -2.0], &[2.0, 2.0]);
         let bits = |numbers: [f32; 2]| numbers.map(|number| number.to_bits() as i32);

@@ -53,7 +53,10 @@ impl Environment for MortarMayhem {
     }
 
     fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
-        if self.state.displayed == DisplayedCharacter::Current {
+        // A needless clone would write to a count on a cache line that all threads read.
+        if self.state.displayed == DisplayedCharacter::Current
+            && !Arc::ptr_eq(&self.earlier_sprites, &self.assets.character)
+        {
             self.earlier_sprites = Arc::clone(&self.assets.character);
         }
         let last_scale = self.assets.config.parameters.agent_scale;
