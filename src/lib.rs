@@ -90,7 +90,7 @@ pub mod pool {
     pub use endless_gym_core::pool::{
         Autoreset, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig, PoolError,
         Registry, RegistryError, ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION, SavedEnv,
-        Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
+        Seeding, SnapshotError, StepTimes, Threads, UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
 }

@@ -45,9 +45,10 @@ fn steps_and_resets_allocate_nothing() {
     if !alone("allocation::steps_and_resets_allocate_nothing") {
         return;
     }
-    for spec in environments().specs() {
-        // Enough environments for two threads, and few enough for one.
-        for (autoreset, num_envs, threads) in [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1)] {
+    // Enough environments for two threads, few enough for one, and in one id enough for many.
+    let sizes = [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1), (Autoreset::NextStep, 320, 20)];
+    for (number, spec) in environments().specs().enumerate() {
+        for (autoreset, num_envs, threads) in sizes.into_iter().take(if number == 0 { 3 } else { 2 }) {
             let config = PoolConfig {
                 seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
                 autoreset,

@@ -14,6 +14,8 @@ pub mod random;
 pub mod raster;
 pub mod trace;
 
+#[allow(unsafe_code)] // Threads write disjoint parts of a batch.
+mod disjoint;
 #[cfg(test)]
 mod property_cases;
 #[cfg(test)]

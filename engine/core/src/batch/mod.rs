@@ -15,12 +15,14 @@ mod block;
 mod buffer;
 mod dtype;
 #[cfg(test)]
+#[allow(unsafe_code)] // Takes a part of a batch.
 mod forged_tests;
 mod frames;
 mod layout;
 pub(crate) mod limits;
 mod sections;
 mod stamp;
+#[allow(unsafe_code)] // Threads write disjoint parts of a batch.
 mod view;
 
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};

@@ -1,25 +1,28 @@
 //! A batch as arrays: [`Batch`] for readers, and [`BatchMut`] for the pool, which writes it in parts.
 
+use std::ops::Range;
+
 use super::block::Block;
 use super::dtype::Element;
 use super::layout::Layout;
 use super::sections::{BatchSection, batch_sections};
+use crate::disjoint::DisjointSlice;
 
 /// Writable rows of one section, one for each environment. If the batch lacks the section, the rows are empty.
 #[derive(Debug)]
 pub(crate) struct RowsMut<'a, T> {
-    numbers: &'a mut [T],
+    numbers: DisjointSlice<'a, T>,
     width: usize,
 }
 
-impl<'a, T> RowsMut<'a, T> {
+impl<T> RowsMut<'_, T> {
     /// The row of one environment; empty if the batch lacks the section.
     ///
     /// # Panics
     ///
     /// If `env` is out of range.
     pub fn row(&mut self, env: usize) -> &mut [T] {
-        &mut self.numbers[env * self.width..(env + 1) * self.width]
+        &mut self.numbers.as_mut()[env * self.width..(env + 1) * self.width]
     }
 
     /// Sets the number of one environment in a section with one number per environment.
@@ -28,12 +31,18 @@ impl<'a, T> RowsMut<'a, T> {
     ///
     /// If `env` is out of range.
     pub fn set(&mut self, env: usize, number: T) {
-        self.numbers[env] = number;
+        self.numbers.as_mut()[env] = number;
     }
 
-    fn split_at(self, env: usize) -> (Self, Self) {
-        let (left, right) = self.numbers.split_at_mut(env * self.width);
-        (RowsMut { numbers: left, width: self.width }, RowsMut { numbers: right, width: self.width })
+    /// The rows of some environments.
+    ///
+    /// # Safety
+    ///
+    /// Those of [`DisjointSlice::part`].
+    unsafe fn part(&self, envs: &Range<usize>) -> RowsMut<'_, T> {
+        // SAFETY: our caller upholds the contract.
+        let numbers = unsafe { self.numbers.part(envs.start * self.width..envs.end * self.width) };
+        RowsMut { numbers, width: self.width }
     }
 }
 
@@ -56,7 +65,7 @@ macro_rules! batch_view {
                 }
                 let mut rest: &mut [u8] = bytemuck::cast_slice_mut(blocks);
                 let mut at = 0;
-                $(let mut $field = RowsMut { numbers: &mut [] as &mut [$element], width: 0 };)*
+                $(let mut $field = RowsMut::<$element> { numbers: DisjointSlice::new(&mut []), width: 0 };)*
                 for section in layout.sections() {
                     let (_, tail) = rest.split_at_mut(section.offset() - at);
                     let (numbers, tail) = tail.split_at_mut(section.bytes());
@@ -64,21 +73,26 @@ macro_rules! batch_view {
                     rest = tail;
                     match section.name() {
                         $(BatchSection::$variant => {
-                            $field = RowsMut { numbers: bytemuck::cast_slice_mut(numbers), width: section.width() };
+                            let numbers = DisjointSlice::new(bytemuck::cast_slice_mut(numbers));
+                            $field = RowsMut { numbers, width: section.width() };
                         })*
                     }
                 }
                 Some(BatchMut { $($field),* })
             }
 
-            /// Splits the batch before environment `env`.
+            /// The rows of some environments.
             ///
             /// # Panics
             ///
-            /// If `env` is out of range.
-            pub fn split_at(self, env: usize) -> (Self, Self) {
-                $(let $field = self.$field.split_at(env);)*
-                (BatchMut { $($field: $field.0),* }, BatchMut { $($field: $field.1),* })
+            /// If they are out of range.
+            ///
+            /// # Safety
+            ///
+            /// While the part exists, no other part contains any of its environments.
+            pub unsafe fn part(&self, envs: Range<usize>) -> BatchMut<'_> {
+                // SAFETY: our caller upholds the contract.
+                BatchMut { $($field: unsafe { self.$field.part(&envs) }),* }
             }
         }
 

@@ -5,6 +5,7 @@
 mod autoreset;
 mod buffers;
 mod config;
+#[allow(unsafe_code)] // Threads step disjoint parts of the environments.
 mod division;
 mod drawn_scene;
 mod env_slot;
@@ -32,4 +33,4 @@ pub use pool::Pool;
 pub use registry::{NoExpert, Registry, RegistryError};
 pub use seeding::Seeding;
 pub use snapshot::{ResumeError, SNAPSHOT_VERSION, SavedEnv, SnapshotError};
-pub use threads::Threads;
+pub use threads::{StepTimes, Threads};

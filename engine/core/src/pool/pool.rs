@@ -89,6 +89,11 @@ impl Pool {
         &self.layout
     }
 
+    /// The threads that step the environments.
+    pub fn threads(&self) -> &Threads {
+        &self.threads
+    }
+
     /// Starts episodes and writes every environment's row: the current observation, a reward of 0, and no flags.
     ///
     /// # Errors

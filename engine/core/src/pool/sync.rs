@@ -19,11 +19,47 @@ pub(super) mod threads {
     pub(in crate::pool) use std::sync::Arc;
     pub(in crate::pool) use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicU64, AtomicUsize, Ordering, fence};
     pub(in crate::pool) use std::thread;
-
-    pub(in crate::pool) use crossbeam_utils::Backoff;
+    use std::time::{Duration, Instant};
 
     /// A worker that has not been called for this long parks. Most trainers call the next step sooner.
-    pub(in crate::pool) const PARK_AFTER: std::time::Duration = std::time::Duration::from_millis(3);
+    pub(in crate::pool) const PARK_AFTER: Duration = Duration::from_millis(3);
+
+    /// Polls between two looks at the clock.
+    const POLLS: u32 = 32;
+
+    /// Waits between polls: spins for a while, then yields.
+    pub(in crate::pool) struct Wait {
+        start: Instant,
+        spin: Duration,
+        waited: Duration,
+        polls: u32,
+    }
+
+    impl Wait {
+        /// Spins until `spin` has passed.
+        pub(in crate::pool) fn new(spin: Duration) -> Self {
+            Wait { start: Instant::now(), spin, waited: Duration::ZERO, polls: 0 }
+        }
+
+        /// Waits until the next poll.
+        pub(in crate::pool) fn pause(&mut self) {
+            self.polls += 1;
+            if self.waited >= self.spin {
+                thread::yield_now();
+            } else {
+                std::hint::spin_loop();
+                if !self.polls.is_multiple_of(POLLS) {
+                    return;
+                }
+            }
+            self.waited = self.start.elapsed();
+        }
+
+        /// The time since the start, a few polls ago.
+        pub(in crate::pool) fn waited(&self) -> Duration {
+            self.waited
+        }
+    }
 }
 
 /// The same primitives under loom. `--cfg crossbeam_loom` models `crossbeam_utils::sync::Parker` itself.
@@ -32,20 +68,25 @@ pub(super) mod threads {
     pub(in crate::pool) use loom::sync::Arc;
     pub(in crate::pool) use loom::sync::atomic::{AtomicBool, AtomicPtr, AtomicU64, AtomicUsize, Ordering, fence};
     pub(in crate::pool) use loom::thread;
+    use std::time::Duration;
 
     /// Workers park at once: loom does not model time, and only a parked worker can miss a call.
-    pub(in crate::pool) const PARK_AFTER: std::time::Duration = std::time::Duration::ZERO;
+    pub(in crate::pool) const PARK_AFTER: Duration = Duration::ZERO;
 
-    /// Yields to another thread. crossbeam's `Backoff` yields to the operating system, which loom does not see.
-    pub(in crate::pool) struct Backoff;
+    /// Yields to another thread.
+    pub(in crate::pool) struct Wait;
 
-    impl Backoff {
-        pub(in crate::pool) fn new() -> Self {
-            Backoff
+    impl Wait {
+        pub(in crate::pool) fn new(_spin: Duration) -> Self {
+            Wait
         }
 
-        pub(in crate::pool) fn snooze(&self) {
+        pub(in crate::pool) fn pause(&mut self) {
             thread::yield_now();
+        }
+
+        pub(in crate::pool) fn waited(&self) -> Duration {
+            Duration::ZERO
         }
     }
 }

@@ -1,12 +1,37 @@
 //! The threads that step a pool's environments.
 
 #[cfg(feature = "threads")]
-#[allow(unsafe_code)] // The crate's only module with unsafe code: see its SAFETY comment.
+mod shares;
+#[cfg(feature = "threads")]
+mod times;
+#[cfg(feature = "threads")]
+#[allow(unsafe_code)] // The task that workers borrow during a call.
 mod workers;
+
+use std::ops::Range;
+use std::time::Duration;
 
 use super::error::PoolError;
 #[cfg(feature = "threads")]
 use crate::batch::limits::MAX_THREADS;
+
+/// Where the time of steps on several threads went. The sum of `opening`, `joining`, `working` and `waiting` is the time between
+/// the calls of the threads and their end; what a step takes beyond it is the calling thread's alone.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StepTimes {
+    /// Steps.
+    pub steps: u64,
+    /// Until the calling thread began to step environments, after it had called and woken the workers.
+    pub opening: Duration,
+    /// From then until a thread joined, as the mean over the threads.
+    pub joining: Duration,
+    /// From then until the last thread joined.
+    pub last_join: Duration,
+    /// The time in which a thread stepped environments, as the mean over the threads.
+    pub working: Duration,
+    /// From the end of a thread's work until all were done, as the mean over the threads.
+    pub waiting: Duration,
+}
 
 /// Threads that step environments: the calling thread and workers. Several pools may share them; they then take turns.
 ///
@@ -25,17 +50,33 @@ impl Threads {
     ///
     /// If there are too many, or if the operating system cannot start them.
     pub fn new(count: usize) -> Result<Self, PoolError> {
+        Self::start(count, false)
+    }
+
+    /// Like [`new`](Self::new), for threads that [measure](Self::take_times) where the time of a step goes.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`new`](Self::new).
+    pub fn timed(count: usize) -> Result<Self, PoolError> {
+        Self::start(count, true)
+    }
+
+    fn start(count: usize, timed: bool) -> Result<Self, PoolError> {
         if count > MAX_THREADS {
             return Err(PoolError::ThreadCount { given: count });
         }
-        let count = if count == 0 {
-            std::thread::available_parallelism().map_or(1, usize::from).min(MAX_THREADS)
-        } else {
-            count
-        };
-        let workers = (count > 1).then(|| workers::Workers::new(count - 1)).transpose();
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let count = if count == 0 { cores.min(MAX_THREADS) } else { count };
+        let workers = (count > 1).then(|| workers::Workers::new(count - 1, count <= cores, timed)).transpose();
         let workers = workers.map_err(|source| PoolError::Threads { count, source })?;
         Ok(Threads { workers: workers.map(std::sync::Arc::new) })
+    }
+
+    /// The sum over all steps on several threads since the last call of this function; `None` for threads that are not
+    /// [`timed`](Self::timed).
+    pub fn take_times(&self) -> Option<StepTimes> {
+        self.workers.as_ref()?.take_times()
     }
 
     /// Number of threads that step environments at the same time, including the calling one.
@@ -43,12 +84,22 @@ impl Threads {
         1 + self.workers.as_ref().map_or(0, |workers| workers.count())
     }
 
-    /// Calls `work(0)` in this thread and, at the same time, `work(n)` for each `n` of `1..=helpers` whose worker joins before
-    /// the calling thread is done. Returns when all calls have returned; a panic in any of them resumes here.
-    pub(super) fn run(&self, helpers: usize, work: &(dyn Fn(usize) + Sync)) {
+    /// Calls `work(n)` in the first `count` threads, where `n` is the thread's number, and returns when all have returned. Unlike a
+    /// step, it waits for workers that sleep. For memory that each thread should be the first to write to, so that it lies near the
+    /// thread's core.
+    pub fn on_each(&self, count: usize, work: &(dyn Fn(usize) + Sync)) {
         match &self.workers {
-            Some(workers) if helpers > 0 => workers.run(helpers, work),
+            Some(workers) if count > 1 => workers.on_each(count.min(self.count()), work),
             _ => work(0),
+        }
+    }
+
+    /// Calls `work` with ranges of `0..items`, in this thread and at the same time in those of `count - 1` workers that join before
+    /// all is done. Each item is in one range. Returns when all calls have returned; a panic in any of them resumes here.
+    pub(super) fn for_each_piece(&self, items: usize, count: usize, work: &(dyn Fn(Range<usize>) + Sync)) {
+        match &self.workers {
+            Some(workers) if count > 1 => workers.for_each_piece(items, count, work),
+            _ => work(0..items),
         }
     }
 }
@@ -68,13 +119,32 @@ impl Threads {
         Ok(Threads {})
     }
 
+    /// Like [`new`](Self::new).
+    ///
+    /// # Errors
+    ///
+    /// Those of [`new`](Self::new).
+    pub fn timed(count: usize) -> Result<Self, PoolError> {
+        Self::new(count)
+    }
+
     /// Number of threads that step environments at the same time: 1.
     pub fn count(&self) -> usize {
         1
     }
 
+    /// Not measured.
+    pub fn take_times(&self) -> Option<StepTimes> {
+        None
+    }
+
     /// Calls `work(0)`.
-    pub(super) fn run(&self, _helpers: usize, work: &(dyn Fn(usize) + Sync)) {
+    pub fn on_each(&self, _count: usize, work: &(dyn Fn(usize) + Sync)) {
         work(0);
+    }
+
+    /// Calls `work(0..items)`.
+    pub(super) fn for_each_piece(&self, items: usize, _count: usize, work: &(dyn Fn(Range<usize>) + Sync)) {
+        work(0..items);
     }
 }

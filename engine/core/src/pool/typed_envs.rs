@@ -17,6 +17,7 @@ use super::seeding::{PoolEntropy, Seeding, Seeds};
 use super::snapshot::{Saved, SnapshotError};
 use super::threads::Threads;
 use crate::batch::BatchMut;
+use crate::disjoint::DisjointSlice;
 use crate::envs::view::{self, Picture};
 use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters};
 use crate::raster::FrameShape;
@@ -149,12 +150,13 @@ impl<E: Environment> TypedEnvs<E> {
         while self.drawn.len() <= context.buffer {
             self.drawn.push((0..self.slots.len() * self.stack).map(|_| DrawnScene::unknown()).collect());
         }
-        let stack = self.stack;
-        let drawn = &mut self.drawn[context.buffer];
-        let all = EnvRange { first: 0, slots: &mut self.slots, drawn, stack, out };
-        all.for_each_piece(context.threads, |piece| {
-            let EnvRange { first, slots, drawn, mut out, .. } = piece;
-            for (row, (slot, drawn)) in slots.iter_mut().zip(drawn.chunks_exact_mut(stack)).enumerate() {
+        let (stack, num_envs) = (self.stack, self.slots.len());
+        let drawn = DisjointSlice::new(&mut self.drawn[context.buffer]);
+        let all = EnvRange { first: 0, slots: DisjointSlice::new(&mut self.slots), drawn, stack, out };
+        all.for_each_piece(num_envs, context.threads, |piece| {
+            let EnvRange { first, mut slots, mut drawn, mut out, .. } = piece;
+            let envs = slots.as_mut().iter_mut().zip(drawn.as_mut().chunks_exact_mut(stack));
+            for (row, (slot, drawn)) in envs.enumerate() {
                 play(first + row, slot, &mut out, row);
                 let frames = out.observation.row(row);
                 if !frames.is_empty() {

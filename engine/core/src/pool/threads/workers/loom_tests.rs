@@ -31,9 +31,13 @@ impl Pieces {
     /// Does the pieces that no other thread has taken.
     fn work(&self) {
         while let Some(piece) = { lock(&self.left).pop() } {
-            // SAFETY: loom checks that no other access is possible at the same time.
-            self.done[piece].with_mut(|times| unsafe { *times += 1 });
+            self.work_on(piece);
         }
+    }
+
+    fn work_on(&self, piece: usize) {
+        // SAFETY: loom checks that no other access is possible at the same time.
+        self.done[piece].with_mut(|times| unsafe { *times += 1 });
     }
 
     /// Asserts that each piece has been done once.
@@ -54,7 +58,7 @@ fn model(preemptions: usize, model: impl Fn() + Sync + Send + 'static) {
 #[test]
 fn loom_every_piece_is_done_once_and_seen_by_the_caller() {
     model(3, || {
-        let workers = Workers::new(1).unwrap();
+        let workers = Workers::new(1, true, false).unwrap();
         let pieces = Pieces::new(2);
         workers.run(1, &|_| pieces.work());
         pieces.check();
@@ -64,7 +68,7 @@ fn loom_every_piece_is_done_once_and_seen_by_the_caller() {
 #[test]
 fn loom_a_second_call_wakes_parked_workers_and_is_not_joined_by_the_first_ones() {
     model(3, || {
-        let workers = Workers::new(1).unwrap();
+        let workers = Workers::new(1, true, false).unwrap();
         for _ in 0..2 {
             // Freed after its call, so a worker that joined late would use freed memory.
             let pieces = Pieces::new(2);
@@ -77,7 +81,7 @@ fn loom_a_second_call_wakes_parked_workers_and_is_not_joined_by_the_first_ones()
 #[test]
 fn loom_two_workers_share_the_pieces() {
     model(2, || {
-        let workers = Workers::new(2).unwrap();
+        let workers = Workers::new(2, true, false).unwrap();
         let pieces = Pieces::new(2);
         workers.run(2, &|_| pieces.work());
         pieces.check();
@@ -87,7 +91,7 @@ fn loom_two_workers_share_the_pieces() {
 #[test]
 fn loom_a_worker_beyond_the_helpers_does_not_join() {
     model(2, || {
-        let workers = Workers::new(2).unwrap();
+        let workers = Workers::new(2, true, false).unwrap();
         let pieces = Pieces::new(2);
         workers.run(1, &|number| {
             assert!(number < 2);
@@ -100,7 +104,7 @@ fn loom_a_worker_beyond_the_helpers_does_not_join() {
 #[test]
 fn loom_two_callers_take_turns() {
     model(3, || {
-        let workers = Arc::new(Workers::new(1).unwrap());
+        let workers = Arc::new(Workers::new(1, true, false).unwrap());
         let other = Arc::clone(&workers);
         let call = |workers: &Workers| {
             let pieces = Pieces::new(1);
@@ -117,22 +121,29 @@ fn loom_two_callers_take_turns() {
 #[test]
 fn loom_a_call_wakes_a_parked_worker() {
     model(3, || {
-        let workers = Workers::new(1).unwrap();
-        let came = AtomicBool::new(false);
-        workers.run(1, &|number| match number {
-            0 => {
-                while !came.load(Ordering::Acquire) {
-                    thread::yield_now();
-                }
-            }
-            _ => came.store(true, Ordering::Release),
-        });
+        let workers = Workers::new(1, true, false).unwrap();
+        let pieces = Pieces::new(2);
+        workers.on_each(2, &|thread| pieces.work_on(thread));
+        pieces.check();
+    });
+}
+
+/// Both threads take pieces of both shares, in two divisions of different sizes.
+#[test]
+fn loom_every_item_of_a_division_is_in_one_piece() {
+    model(3, || {
+        let workers = Workers::new(1, true, false).unwrap();
+        for items in [10, 9] {
+            let pieces = Pieces::new(items);
+            workers.for_each_piece(items, 2, &|items| items.for_each(|item| pieces.work_on(item)));
+            pieces.check();
+        }
     });
 }
 
 #[test]
 fn loom_workers_end_without_a_call() {
-    model(3, || drop(Workers::new(2).unwrap()));
+    model(3, || drop(Workers::new(2, true, false).unwrap()));
 }
 
 /// Two threads write the same batch as the calling thread alone.
