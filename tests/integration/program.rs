@@ -339,6 +339,38 @@ fn bench_measures_every_method() {
 }
 
 #[test]
+fn bench_says_where_the_time_of_a_step_goes() {
+    let place = Place::new();
+    let run = |arguments: &[&str]| {
+        let bench = ["bench", "--num-envs", "256", "--seconds", "0.05", "--rounds", "1", "--threads", "2,3"];
+        let output = place.run(&[&bench, arguments].concat());
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        text(&output.stdout).to_owned()
+    };
+    let json: Json = serde_json::from_str(&run(&["--json"])).unwrap();
+    let rows = json[0]["threads"].as_array().unwrap();
+    assert_eq!(rows.iter().map(|row| row["threads"].as_u64().unwrap()).collect::<Vec<_>>(), [1, 2, 3]);
+    let number = |value: &Json| value.as_f64().unwrap();
+    assert!((number(&rows[0]["efficiency"]) - 1.0).abs() < 1e-9);
+    for row in rows {
+        let ratio = number(&row["service_steps_per_second"]) / number(&row["steps_per_second"]);
+        assert!((number(&row["service_ratio"]) - ratio).abs() < 1e-9);
+        let step = number(&row["step"]);
+        assert!((step * number(&row["steps_per_second"]) - 256e6).abs() < 1.0);
+        let parts = &row["parts"];
+        assert_eq!(parts.is_null(), row["threads"] == 1);
+        if !parts.is_null() {
+            let [opening, joining, last_join, work, waiting] =
+                ["opening", "joining", "last_join", "work", "waiting"].map(|part| number(&parts[part]));
+            assert!((opening + joining + work + waiting - step).abs() < 1e-3 * step);
+            assert!(opening > 0.0 && joining >= 0.0 && last_join >= joining && work > 0.0 && waiting >= 0.0, "{parts}");
+        }
+    }
+    let table = run(&[]);
+    assert!(table.contains("efficiency") && table.contains("last join") && table.contains("trainer"), "{table}");
+}
+
+#[test]
 fn output_that_cannot_be_written_is_a_failure() {
     let place = Place::new();
     let trace = &traces("MortarMayhem-Grid-v0")[0];

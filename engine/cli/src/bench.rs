@@ -1,12 +1,14 @@
 //! `endless bench`.
 
+mod scaling;
+
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{BLOCK_BYTES, Batch, BatchBuffer};
 use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::pool::{Pool, Registry, ResetRequest, Threads};
+use endless_gym_core::pool::{Pool, Registry, ResetRequest, StepTimes, Threads};
 use endless_gym_service::EngineConfig;
 use serde::Serialize;
 
@@ -33,9 +35,10 @@ pub struct Args {
     /// Number of environments.
     #[arg(long, default_value_t = 1024)]
     num_envs: usize,
-    /// Threads of the engine that serves the environments; 0 for one per core.
-    #[arg(long, default_value_t = 1)]
-    threads: usize,
+    /// Threads of the engine that serves the environments; 0 for one per core. Several numbers, such as `1,2,4,8`, print how speed
+    /// grows with the threads instead, in process and through the service, and where the time of a step goes.
+    #[arg(long, value_name = "N,..", value_delimiter = ',', default_value = "1")]
+    threads: Vec<usize>,
     /// Duration of one measurement in seconds.
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
@@ -95,6 +98,8 @@ struct Round {
     steps_per_second: f64,
     batch_bytes: Option<usize>,
     huge_page_bytes: Option<u64>,
+    /// Of an in-process measurement with several threads.
+    times: StepTimes,
 }
 
 /// Runs `endless bench`.
@@ -104,6 +109,9 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     let specs: Vec<&EnvSpec> =
         if args.id == "all" { registry.specs().collect() } else { vec![registry.spec(&args.id)?] };
     let cores = Threads::new(0)?.count();
+    let [service_threads] = args.threads[..] else {
+        return scaling::run(registry, args, &specs, cores, stop);
+    };
     let mut methods = vec![Method::InProcess { threads: 1 }];
     if cores > 1 {
         methods.push(Method::InProcess { threads: cores });
@@ -119,17 +127,14 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
         for _ in 0..args.rounds {
             for (method, results) in methods.iter().zip(&mut results) {
                 bar.set_message(format!("{}, {}", spec.id, name(*method)));
-                results.push(measure(registry, args, spec, *method, stop)?);
-                if stop.load(Ordering::Relaxed) {
-                    return Err("stopped before all measurements were done".into());
-                }
+                results.push(measure(registry, args, spec, *method, service_threads, stop)?);
                 bar.inc(1);
             }
         }
         rows.push(Row {
             environment: spec.id,
             num_envs: args.num_envs,
-            service_threads: Threads::new(args.threads)?.count(),
+            service_threads: Threads::new(service_threads)?.count(),
             measurements: methods
                 .iter()
                 .zip(results)
@@ -217,26 +222,36 @@ fn measure(
     args: &Args,
     spec: &EnvSpec,
     method: Method,
+    service_threads: usize,
     stop: &AtomicBool,
 ) -> Result<Round, Failure> {
     match method {
-        Method::InProcess { threads } => in_process(registry, args, spec, threads, stop),
-        Method::ServiceReceives => through_service(args, spec, false, stop),
-        Method::ServiceReads => through_service(args, spec, true, stop),
+        Method::InProcess { threads } => in_process(registry, args, spec, &Threads::new(threads)?, stop),
+        Method::ServiceReceives => through_service(args, spec, false, service_threads, stop),
+        Method::ServiceReads => through_service(args, spec, true, service_threads, stop),
         Method::Original => Ok(Round { steps_per_second: original(args, spec)?, ..Round::default() }),
     }
 }
 
-/// Calls `step` for `--seconds` after a few warm-up calls, and returns the steps per second of all environments.
-fn time(args: &Args, stop: &AtomicBool, mut step: impl FnMut() -> Result<(), Failure>) -> Result<f64, Failure> {
+/// Calls `step` for `--seconds` after a few warm-up calls and `warm`, and returns the steps per second of all environments.
+fn time(
+    args: &Args,
+    stop: &AtomicBool,
+    warm: impl FnOnce(),
+    mut step: impl FnMut() -> Result<(), Failure>,
+) -> Result<f64, Failure> {
     const WARM_UP: usize = 20;
     for _ in 0..WARM_UP {
         step()?;
     }
+    warm();
     let (start, mut batches) = (Instant::now(), 0);
     while start.elapsed().as_secs_f64() < args.seconds && !stop.load(Ordering::Relaxed) {
         step()?;
         batches += 1;
+    }
+    if stop.load(Ordering::Relaxed) {
+        return Err("stopped before all measurements were done".into());
     }
     Ok((batches * args.num_envs) as f64 / start.elapsed().as_secs_f64())
 }
@@ -245,16 +260,19 @@ fn in_process(
     registry: &Registry,
     args: &Args,
     spec: &EnvSpec,
-    threads: usize,
+    threads: &Threads,
     stop: &AtomicBool,
 ) -> Result<Round, Failure> {
-    let mut pool = Pool::new(registry, &args.environment.configure(spec.id, args.num_envs)?, &Threads::new(threads)?)?;
+    let mut pool = Pool::new(registry, &args.environment.configure(spec.id, args.num_envs)?, threads)?;
     let mut actions = Actions::new(spec, args.num_envs);
     let before = huge_pages::bytes(std::process::id(), huge_pages::PRIVATE);
     let mut blocks = BatchBuffer::new(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut blocks)?;
     let after = huge_pages::bytes(std::process::id(), huge_pages::PRIVATE);
-    let steps_per_second = time(args, stop, || {
+    let restart = || {
+        threads.take_times();
+    };
+    let steps_per_second = time(args, stop, restart, || {
         pool.step(actions.next(), &mut blocks)?;
         Ok(())
     })?;
@@ -262,28 +280,41 @@ fn in_process(
         steps_per_second,
         batch_bytes: Some(blocks.len() * BLOCK_BYTES),
         huge_page_bytes: after.zip(before).map(|(after, before)| after.saturating_sub(before)),
+        times: threads.take_times().unwrap_or_default(),
     })
 }
 
-fn through_service(args: &Args, spec: &EnvSpec, reads: bool, stop: &AtomicBool) -> Result<Round, Failure> {
+fn through_service(
+    args: &Args,
+    spec: &EnvSpec,
+    reads: bool,
+    threads: usize,
+    stop: &AtomicBool,
+) -> Result<Round, Failure> {
     let pool = args.environment.configure(spec.id, args.num_envs)?;
-    let mut engine = EngineProcess::start(EngineConfig::new("endless", pool, args.threads))?;
+    let mut engine = EngineProcess::start(EngineConfig::new("endless", pool, threads))?;
     let mut trainer = engine.connect(stop)?;
     let mut actions = Actions::new(spec, args.num_envs);
     trainer.reset(0, ResetRequest::All)?;
     let mut batch_bytes = None;
-    let steps_per_second = time(args, stop, || {
-        let received = trainer.receive(0, STEP_TIMEOUT)?;
-        batch_bytes = Some(received.batch().bytes().len());
-        if reads {
-            std::hint::black_box(sum(&received.batch()));
-        }
-        // Release the lease before the next step, so that the engine writes to memory that is still in its cache.
-        drop(received);
-        trainer.send(0, actions.next())?;
-        Ok(())
-    })?;
-    Ok(Round { steps_per_second, batch_bytes, huge_page_bytes: huge_pages::bytes(engine.id(), huge_pages::SHARED) })
+    let steps_per_second = time(
+        args,
+        stop,
+        || {},
+        || {
+            let received = trainer.receive(0, STEP_TIMEOUT)?;
+            batch_bytes = Some(received.batch().bytes().len());
+            if reads {
+                std::hint::black_box(sum(&received.batch()));
+            }
+            // Release the lease before the next step, so that the engine writes to memory that is still in its cache.
+            drop(received);
+            trainer.send(0, actions.next())?;
+            Ok(())
+        },
+    )?;
+    let huge_page_bytes = huge_pages::bytes(engine.id(), huge_pages::SHARED);
+    Ok(Round { steps_per_second, batch_bytes, huge_page_bytes, ..Round::default() })
 }
 
 /// Random actions drawn before the measurement, as in `original.py`.
