@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use endless_gym_core::pool::Threads;
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -85,7 +86,8 @@ fn request_publisher(
     specification: &ServiceSpecification,
 ) -> Result<RequestPublisher, ServiceError> {
     let service = services.requests(group)?;
-    let publisher = || ports::publisher(&service, specification.action.blocks(), REQUEST_CHUNKS).map(|(port, _)| port);
+    let (blocks, threads) = (specification.action.blocks(), Threads::new(1)?);
+    let publisher = || ports::publisher(&service, blocks, REQUEST_CHUNKS, &threads).map(|(port, _)| port);
     create(services, specification, publisher, || ports::publisher_node(&service))
 }
 

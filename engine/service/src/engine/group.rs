@@ -67,7 +67,8 @@ impl Group {
             .map_err(ServiceError::middleware("cannot create a subscriber"))?;
         let service = services.responses(number, limits)?;
         // An observer reserves its chunks when it connects.
-        let publisher = ports::publisher(&service, ports::chunk_blocks(pool.layout()), limits.trainer_chunks());
+        let blocks = ports::chunk_blocks(pool.layout());
+        let publisher = ports::publisher(&service, blocks, limits.trainer_chunks(), pool.threads());
         let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
         Ok(Group {
             pool,

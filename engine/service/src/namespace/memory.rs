@@ -5,11 +5,13 @@
 //! use, and missing memory is an error.
 
 use std::mem::MaybeUninit;
+use std::sync::{Mutex, PoisonError};
 
 use rustix::io::Errno;
 use rustix::mm::Advice;
 
 use endless_gym_core::batch::BLOCK_BYTES;
+use endless_gym_core::pool::Threads;
 
 use crate::error::ServiceError;
 use crate::namespace::resource_limits;
@@ -31,9 +33,13 @@ pub(crate) fn check_free(needed: u64) -> Result<(), ServiceError> {
     }
 }
 
-/// The addresses of the chunks that have been prefaulted.
-#[derive(Debug, Default)]
-pub(crate) struct PrefaultedChunks(Vec<usize>);
+/// Prefaults chunks, each in parts by the threads that will write them, so that a part lies in the memory near its thread's core.
+#[derive(Debug)]
+pub(crate) struct PrefaultedChunks {
+    /// Addresses of the chunks that have been prefaulted.
+    addresses: Vec<usize>,
+    threads: Threads,
+}
 
 impl PrefaultedChunks {
     /// Fails if `/dev/shm` has no room for `chunks` chunks of `blocks` blocks.
@@ -41,20 +47,33 @@ impl PrefaultedChunks {
         check_free(needed(blocks, chunks))
     }
 
+    /// No chunk yet.
+    pub(crate) fn new(threads: &Threads) -> Self {
+        PrefaultedChunks { addresses: Vec::new(), threads: threads.clone() }
+    }
+
     /// Prefaults a chunk unless it has been prefaulted before.
-    pub(crate) fn prefault<T>(&mut self, chunk: &mut [MaybeUninit<T>]) -> Result<(), ServiceError> {
-        let address = chunk.as_ptr().addr();
-        if self.0.contains(&address) {
+    pub(crate) fn prefault<T: Send>(&mut self, chunk: &mut [MaybeUninit<T>]) -> Result<(), ServiceError> {
+        let (address, bytes) = (chunk.as_ptr().addr(), size_of_val(chunk));
+        if self.addresses.contains(&address) {
             return Ok(());
         }
-        match populate(chunk) {
-            // Linux before 5.14 does not support the advice; `check_available` must suffice.
-            Ok(()) | Err(Errno::INVAL) => {
-                self.0.push(address);
-                Ok(())
+        let part = chunk.len().div_ceil(self.threads.count()).max(1);
+        let parts: Vec<_> = chunk.chunks_mut(part).map(|part| Mutex::new((part, Ok(())))).collect();
+        self.threads.on_each(parts.len(), &|thread| {
+            let Some(part) = parts.get(thread) else { return };
+            let (part, result) = &mut *part.lock().unwrap_or_else(PoisonError::into_inner);
+            *result = populate(part);
+        });
+        for part in parts {
+            match part.into_inner().unwrap_or_else(PoisonError::into_inner).1 {
+                // Linux before 5.14 does not support the advice; `check_available` must suffice.
+                Ok(()) | Err(Errno::INVAL) => {}
+                Err(_) => return Err(too_small(bytes as u64 + MARGIN)),
             }
-            Err(_) => Err(too_small(size_of_val(chunk) as u64 + MARGIN)),
         }
+        self.addresses.push(address);
+        Ok(())
     }
 }
 
@@ -138,8 +157,10 @@ mod tests {
         let blocks = page / BLOCK_BYTES;
         // SAFETY: both pages are mapped for writing and not used elsewhere; the second is never accessed.
         let (present, missing) = unsafe { std::slice::from_raw_parts_mut(start, 2 * blocks) }.split_at_mut(blocks);
-        let mut chunks = PrefaultedChunks::default();
-        chunks.prefault(&mut present[1..]).unwrap();
-        assert!(matches!(chunks.prefault(missing), Err(ServiceError::SharedMemoryTooSmall { .. })));
+        for threads in [1, 2] {
+            let mut chunks = PrefaultedChunks::new(&Threads::new(threads).unwrap());
+            chunks.prefault(&mut present[1..]).unwrap();
+            assert!(matches!(chunks.prefault(missing), Err(ServiceError::SharedMemoryTooSmall { .. })));
+        }
     }
 }

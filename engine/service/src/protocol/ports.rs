@@ -1,6 +1,7 @@
 //! The iceoryx2 services and ports of an engine.
 
 use endless_gym_core::batch::{Layout, SNAPSHOT_BYTES, blocks_for};
+use endless_gym_core::pool::Threads;
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::listener::{Listener, ListenerCreateError};
 use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
@@ -193,12 +194,13 @@ macro_rules! open_failure {
 open_failure!(PublishSubscribeOpenError, IncompatibleTypes | IncompatibleMessagingPattern);
 open_failure!(EventOpenError, IncompatibleMessagingPattern);
 
-/// A publisher of messages of `blocks` blocks. Prefaults `prefaulted` chunks, so that missing memory is an error here and not a
-/// SIGBUS later.
+/// A publisher of messages of `blocks` blocks. Prefaults `prefaulted` chunks by `threads`, so that missing memory is an error here and
+/// not a SIGBUS later.
 pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
     service: &BlockService<H>,
     blocks: usize,
     prefaulted: usize,
+    threads: &Threads,
 ) -> Result<(BlockPublisher<H>, PrefaultedChunks), PortError> {
     PrefaultedChunks::check_available(blocks, prefaulted)?;
     let publisher = service
@@ -210,7 +212,7 @@ pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
         .max_loaned_samples(prefaulted)
         .override_sample_preallocation(move |chunks| chunks - (prefaulted - 1))
         .create()?;
-    let mut memory = PrefaultedChunks::default();
+    let mut memory = PrefaultedChunks::new(threads);
     let mut loans = Vec::with_capacity(prefaulted);
     for _ in 0..prefaulted {
         PrefaultedChunks::check_available(blocks, 1)?;
