@@ -9,6 +9,7 @@
 pub mod batch;
 pub mod conformance;
 pub mod envs;
+pub mod files;
 pub mod pool;
 pub mod random;
 pub mod raster;
@@ -16,6 +17,10 @@ pub mod trace;
 
 #[allow(unsafe_code)] // Threads write disjoint parts of a batch.
 mod disjoint;
+mod printable;
+
+pub use printable::printable;
+
 #[cfg(test)]
 mod property_cases;
 #[cfg(test)]

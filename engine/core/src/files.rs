@@ -1,0 +1,60 @@
+//! Reads files whose paths come from users.
+
+use std::fs::File;
+use std::io::{self, ErrorKind, Read};
+use std::path::Path;
+
+/// Opens a regular file for reading. Anything else is an error: opening a FIFO would wait for a writer, and a device may never end.
+///
+/// # Errors
+///
+/// If the file cannot be opened or is not a regular file.
+pub fn open(path: &Path) -> io::Result<File> {
+    let mut options = File::options();
+    options.read(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, rustix::fs::OFlags::NONBLOCK.bits().cast_signed());
+    let file = options.open(path)?;
+    if file.metadata()?.is_file() {
+        Ok(file)
+    } else {
+        Err(io::Error::new(ErrorKind::InvalidInput, "it is not a regular file"))
+    }
+}
+
+/// Reads a regular file, as many bytes as it has when it is opened.
+///
+/// # Errors
+///
+/// As for [`open`], or if the file cannot be read.
+pub fn read(path: &Path) -> io::Result<Vec<u8>> {
+    let file = open(path)?;
+    let (length, mut content) = (file.metadata()?.len(), Vec::new());
+    content.try_reserve_exact(usize::try_from(length).unwrap_or(usize::MAX))?;
+    file.take(length).read_to_end(&mut content)?;
+    Ok(content)
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    #[test]
+    fn only_regular_files_are_read() {
+        let folder = std::env::temp_dir().join(format!("endless-files-{}", std::process::id()));
+        std::fs::create_dir(&folder).unwrap();
+        let [file, link, fifo] = ["file", "link", "fifo"].map(|name| folder.join(name));
+        std::fs::write(&file, [7; 100_000]).unwrap();
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        assert!(Command::new("mkfifo").arg(&fifo).status().unwrap().success());
+        assert_eq!(read(&file).unwrap(), [7; 100_000]);
+        assert_eq!(read(&link).unwrap().len(), 100_000);
+        for other in [&fifo, &folder, Path::new("/dev/zero"), Path::new("/dev/null")] {
+            assert_eq!(read(other).unwrap_err().to_string(), "it is not a regular file");
+        }
+        assert_eq!(read(&folder.join("missing")).unwrap_err().kind(), ErrorKind::NotFound);
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+}
