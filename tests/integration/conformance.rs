@@ -171,8 +171,8 @@ fn each_seeded_mistake_is_found() {
         (problems::<Sum<TRUTH_NAN>>(), "a number of the ground truth is NaN"),
         (problems::<Sum<ALLOCATES>>(), " allocations in 400 steps"),
         (problems::<Sum<TRUTH_OUTSIDE>>(), "a number of the ground truth is "),
-        (problems::<Sum<ACTION_PANICS>>(), "it panicked: not implemented"),
-        (problems::<Sum<LIMIT_PANICS>>(), "`start` = 10: too large"),
+        (problems::<Sum<ACTION_PANICS>>(), "panicked in environment 0, in an episode with seed 0: not implemented"),
+        (problems::<Sum<LIMIT_PANICS>>(), "`start` = 10: Sum-v0 panicked in environment 0"),
         (problems::<Sum<THREAD_MATTERS>>(), "with three threads"),
         (problems::<Sum<FEATURE_INFINITE>>(), "the feature `sum` is"),
     ];

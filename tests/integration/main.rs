@@ -7,6 +7,7 @@ mod conformance;
 mod drawing;
 mod examples;
 mod experts;
+mod faulty_environments;
 mod films;
 mod formats;
 mod independent_episodes;

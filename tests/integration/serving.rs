@@ -2,7 +2,6 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
-use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -355,19 +354,4 @@ fn the_log_option_overrides_the_variable() {
     let wrong = place.run(&["list", "--log=loud=very"]);
     assert_eq!(wrong.status.code(), Some(1));
     assert!(text(&wrong.stderr).starts_with("endless: --log must be off, error, warn"), "{}", text(&wrong.stderr));
-}
-
-#[test]
-fn a_second_signal_ends_the_program_at_once() {
-    let place = Place::new();
-    // A FIFO without a reader blocks the last checkpoint, so the engine never ends on its own.
-    let fifo: PathBuf = place.root().join("state.new");
-    let mut engine = serve(&place, &[&format!("--checkpoint={}", place.root().join("state").display())]);
-    Twin::new().reset(&mut place.trainer("gym").unwrap());
-    assert!(Command::new("mkfifo").arg(&fifo).status().unwrap().success());
-    engine.signal(Signal::INT);
-    std::thread::sleep(Duration::from_millis(500));
-    assert_eq!(engine.0.try_wait().unwrap(), None, "the engine waits");
-    engine.signal(Signal::INT);
-    assert_eq!(engine.wait().code(), Some(130));
 }

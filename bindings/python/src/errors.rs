@@ -18,7 +18,9 @@ pub fn pool(error: PoolError) -> PyErr {
     let text = error.to_string();
     match error {
         PoolError::NotReset => PyRuntimeError::new_err(NOT_RESET),
-        PoolError::Threads { .. } | PoolError::BatchTooShort { .. } => PyRuntimeError::new_err(text),
+        PoolError::Threads { .. } | PoolError::BatchTooShort { .. } | PoolError::Panic(_) => {
+            PyRuntimeError::new_err(text)
+        }
         _ => PyValueError::new_err(text),
     }
 }
@@ -28,6 +30,7 @@ pub fn snapshot(error: SnapshotError) -> PyErr {
     let text = error.to_string();
     match error {
         SnapshotError::NotReset => PyRuntimeError::new_err(NOT_RESET),
+        SnapshotError::Panic(_) => PyRuntimeError::new_err(text),
         _ => PyValueError::new_err(text),
     }
 }
@@ -38,6 +41,7 @@ pub fn service(error: ServiceError) -> PyErr {
     let text = match &error {
         // The same messages as for a pool in this process.
         E::Rejected { reason: Rejection::NotReset, .. } => NOT_RESET.to_owned(),
+        E::Rejected { reason: Rejection::Panic, .. } => error.to_string(),
         E::Rejected { message, .. } => message.clone(),
         // With the names of the Python methods.
         E::AnswerPending { group } => {
@@ -59,7 +63,9 @@ pub fn service(error: ServiceError) -> PyErr {
         | E::EngineUnreachable { .. }
         | E::TrainerExists { .. }
         | E::TooManyObservers { .. } => PyConnectionError::new_err(text),
-        E::Rejected { reason: Rejection::NotReset | Rejection::Checkpoint, .. } => PyRuntimeError::new_err(text),
+        E::Rejected { reason: Rejection::NotReset | Rejection::Checkpoint | Rejection::Panic, .. } => {
+            PyRuntimeError::new_err(text)
+        }
         E::TimedOut { .. } | E::NamespaceLocked { .. } => PyTimeoutError::new_err(text),
         E::InvalidName { .. }
         | E::InvalidTimeout { .. }

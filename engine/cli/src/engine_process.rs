@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{ConnectConfig, EngineConfig, ServiceError, Trainer};
+use endless_gym_service::{ConnectConfig, EngineConfig, Namespace, ROOT_VARIABLE, ServiceError, Trainer};
 
 use super::failure::Failure;
 
@@ -31,6 +31,18 @@ static EXECUTABLE: OnceLock<Vec<OsString>> = OnceLock::new();
 /// Sets the command that starts `endless`. Only the first call has an effect.
 pub fn set_executable(command: &[OsString]) {
     EXECUTABLE.get_or_init(|| command.to_vec());
+}
+
+/// Ends this process, whose threads cannot be stopped, and removes the files of its engine. Another program takes its place: a process
+/// cannot remove the resources of threads that still use them.
+pub fn replace_by_cleanup(namespace: &Namespace) {
+    if let Some((program, first)) = EXECUTABLE.get().and_then(|command| command.split_first()) {
+        let mut command = Command::new(program);
+        command.args(first).arg("clean").env(ROOT_VARIABLE, namespace.root());
+        // It returns only if it fails; the next engine removes the files then.
+        let _ = command.stdin(Stdio::null()).exec();
+    }
+    std::process::exit(1)
 }
 
 /// A child process that serves environments. It ends when this value is dropped, and when this process dies.
@@ -156,8 +168,6 @@ fn read_message(mut stderr: ChildStderr) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_service::Namespace;
-
     use super::*;
 
     /// The error of connecting to a shell script instead of an engine.

@@ -35,6 +35,7 @@ use std::ffi::OsString;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use endless_gym_core::pool::Registry;
+use endless_gym_service::Namespace;
 use endless_gym_trainer::settings::{self, Settings};
 use nix::sys::signal::{SigSet, Signal};
 
@@ -93,6 +94,9 @@ enum Command {
     New(new::Args),
     /// Write the page that plays the environments of your crate in a browser, for any web server.
     Page(page::Args),
+    /// Remove what dead processes left in the namespace. The status is that of a failure, as the process was one that failed.
+    #[command(hide = true)]
+    Clean,
     /// Write the raw frames of an expert's episode to standard output.
     #[command(hide = true)]
     Frames(frames::Args),
@@ -193,6 +197,7 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::New(args) => new::run(registry, &args)?,
         Command::Page(args) => page::run(registry, &args)?,
         Command::Frames(args) => frames::run(registry, &args)?,
+        Command::Clean => return Ok(endless_gym_service::running_engines(&Namespace::default()).is_err()),
         Command::Verify(args) => return verify::run(registry, &args),
         Command::Check(args) => return check::run(registry, &args),
     }

@@ -2,18 +2,21 @@
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 use std::thread;
 use std::time::Duration;
 
+use endless_gym_core::files;
 use endless_gym_core::pool::{Autoreset, PoolConfig, Registry};
-use endless_gym_service::{CheckpointConfig, Engine, EngineConfig, ServiceError};
+use endless_gym_service::{CheckpointConfig, Engine, EngineActivity, EngineConfig, ServiceError};
 use endless_gym_view::MetricsServer;
 use serde::Deserialize;
 
+use super::engine_process::replace_by_cleanup;
 use super::failure::Failure;
 use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
 use super::output::{grouped, print, print_error};
-use super::stop;
+use super::stop::{self, Watchdog};
 
 /// The arguments, or groups of arguments, that make up a configuration.
 const CONFIGURATION: [&str; 12] = [
@@ -117,10 +120,28 @@ fn read(path: &Path) -> Result<EngineConfig, Failure> {
     let config = if path == Path::new("-") {
         EngineConfig::deserialize(&mut serde_json::Deserializer::from_reader(std::io::stdin()))
     } else {
-        let text = std::fs::read(path).map_err(|e| format!("--config {}: {e}", path.display()))?;
+        let text = files::read(path).map_err(|e| format!("--config {}: {e}", path.display()))?;
         serde_json::from_slice(&text)
     };
     Ok(config.map_err(|e| format!("--config {}: {e}", path.display()))?)
+}
+
+/// Ends this process if the engine was asked to stop while a step, or another call of an environment, does not end. Saving a
+/// checkpoint takes as long as it takes.
+fn watch(engine: &Engine, config: &EngineConfig, stop: &'static AtomicBool) -> Result<Option<Watchdog>, Failure> {
+    let Some(monitor) = engine.monitor() else { return Ok(None) };
+    let (service, id, namespace) = (config.service.clone(), config.pool.id.clone(), config.namespace.clone());
+    let stuck = move |grace| match monitor.activity() {
+        activity @ EngineActivity::Busy { kind, since, .. } if since >= grace && kind != "checkpoint" => {
+            Some(format!("engine `{service}` of {id} was asked to stop, but {activity}; it ends without saving"))
+        }
+        _ => None,
+    };
+    let end = move |text| {
+        print_error(text);
+        replace_by_cleanup(&namespace)
+    };
+    stop::watch(stop, stuck, end).map(Some)
 }
 
 /// Runs `endless serve`, until a signal stops it.
@@ -164,7 +185,10 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
         thread::Builder::new().name("metrics".to_owned()).spawn(serve)?;
     }
     let summary = loop {
-        match engine.run(stop) {
+        let watchdog = watch(&engine, &config, stop)?;
+        let finished = engine.run(stop);
+        drop(watchdog);
+        match finished {
             // The episodes are lost, but a trainer can reconnect without user action.
             Err(error @ ServiceError::RootRemoved { .. }) => {
                 print_error(&error);

@@ -3,7 +3,7 @@
 use std::io::Read;
 use std::os::unix::process::parent_id;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{SigSet, Signal};
@@ -28,6 +28,9 @@ const SAME_SIGNAL: Duration = Duration::from_millis(200);
 /// How often a waiting command checks its flag.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
+/// How long a command that was asked to stop may take for one piece of work.
+const GRACE: Duration = Duration::from_secs(5);
+
 /// Exit status of a process ended by a second signal, the same as for one killed by SIGINT.
 const INTERRUPTED: i32 = 130;
 
@@ -40,9 +43,7 @@ pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
         STOP.store(true, Ordering::Relaxed);
         let mut first = FIRST_SIGNAL.lock().unwrap_or_else(PoisonError::into_inner);
         if first.get_or_insert_with(Instant::now).elapsed() >= SAME_SIGNAL {
-            if let Some(action) = BEFORE_EXIT.lock().unwrap_or_else(PoisonError::into_inner).take() {
-                action();
-            }
+            prepare_exit();
             std::process::exit(INTERRUPTED);
         }
     };
@@ -71,6 +72,46 @@ pub fn keep_ignored_hangup() {
 /// Sets what to do before a second signal ends the process.
 pub fn before_exit(action: fn()) {
     *BEFORE_EXIT.lock().unwrap_or_else(PoisonError::into_inner) = Some(action);
+}
+
+fn prepare_exit() {
+    if let Some(action) = BEFORE_EXIT.lock().unwrap_or_else(PoisonError::into_inner).take() {
+        action();
+    }
+}
+
+/// Watches a command that may not notice the flag, until this is dropped.
+#[must_use]
+pub struct Watchdog(#[expect(dead_code, reason = "held until it is dropped")] Arc<()>);
+
+/// Calls `end`, which does not return if it ends the process, when the flag has been set for [`GRACE`] and `stuck` says that one
+/// piece of work has taken as long, and what it is.
+///
+/// # Errors
+///
+/// A thread cannot be started.
+pub fn watch(
+    stop: &'static AtomicBool,
+    stuck: impl Fn(Duration) -> Option<String> + Send + 'static,
+    end: impl Fn(String) + Send + 'static,
+) -> Result<Watchdog, Failure> {
+    let running = Arc::new(());
+    let command = Arc::downgrade(&running);
+    let watches = move || {
+        let mut asked = None;
+        while command.strong_count() > 0 {
+            if stop.load(Ordering::Relaxed)
+                && asked.get_or_insert_with(Instant::now).elapsed() >= GRACE
+                && let Some(work) = stuck(GRACE)
+            {
+                prepare_exit();
+                end(work);
+            }
+            std::thread::sleep(PARENT_INTERVAL);
+        }
+    };
+    std::thread::Builder::new().name("watchdog".to_owned()).spawn(watches).map_err(no_thread)?;
+    Ok(Watchdog(running))
 }
 
 /// Waits up to `time` for the flag, and returns whether it is set.

@@ -18,7 +18,9 @@ use serde_json::{Map, Value as Json, json};
 
 use crate::batch::{Batch, Block, Frames, zeroed};
 use crate::envs::{ActionSpace, EnvSpec, ObservationSpace, Parameter, ParameterKind, Task, UnknownEnvironment};
-use crate::pool::{Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
+use crate::pool::{
+    Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads, message,
+};
 use crate::random::Generator;
 use crate::raster::PixelFormat;
 
@@ -85,11 +87,6 @@ pub fn assert_conforms<T: Task>() {
         let problems: Vec<_> = problems.collect();
         assert!(problems.is_empty(), "{} breaks rules:\n{}", spec.id, problems.join("\n"));
     }
-}
-
-fn message(panic: &(dyn std::any::Any + Send)) -> String {
-    let text = panic.downcast_ref::<String>().map(String::as_str).or_else(|| panic.downcast_ref::<&str>().copied());
-    text.unwrap_or("without a message").to_owned()
 }
 
 /// A pool with the memory for its batch and random actions.

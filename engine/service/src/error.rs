@@ -298,7 +298,7 @@ pub enum ServiceError {
         /// The first property that differs between the two.
         what: &'static str,
     },
-    /// The engine rejected a request. No environment has changed.
+    /// The engine rejected a request. Except for [`Rejection::Panic`], no environment has changed.
     #[error("engine `{service}` rejected the request for group {group}: {message}")]
     Rejected {
         /// The engine's name.
@@ -309,6 +309,14 @@ pub enum ServiceError {
         reason: Rejection,
         /// The engine's explanation.
         message: String,
+    },
+    /// An environment of the engine panicked, and the engine ends: its code has a defect.
+    #[error("the engine ends, since in group {group} {panic}")]
+    Panic {
+        /// The group.
+        group: usize,
+        /// The environment, its seed, and the message of the panic.
+        panic: String,
     },
     /// The environments could not be created, or there is no environment of that number.
     #[error(transparent)]
@@ -355,7 +363,7 @@ impl ServiceError {
     }
 }
 
-/// Why an engine rejected a request. No environment has changed.
+/// Why an engine rejected a request. Except for [`Rejection::Panic`], no environment has changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rejection {
     /// The request has another layout version.
@@ -374,10 +382,12 @@ pub enum Rejection {
     Snapshot,
     /// The checkpoint cannot be saved.
     Checkpoint,
+    /// An environment panicked, and the engine ends.
+    Panic,
 }
 
 impl Rejection {
-    const ALL: [Rejection; 8] = [
+    const ALL: [Rejection; 9] = [
         Rejection::Version,
         Rejection::Kind,
         Rejection::Payload,
@@ -386,6 +396,7 @@ impl Rejection {
         Rejection::Options,
         Rejection::Snapshot,
         Rejection::Checkpoint,
+        Rejection::Panic,
     ];
 
     /// The status in a response header. 0 is the status of a batch.

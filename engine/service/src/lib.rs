@@ -149,7 +149,7 @@ pub use client::lease::BatchLease;
 pub use client::observer::{Observed, Observer, Observers};
 pub use client::pictures::{Drawn, Pictures};
 pub use client::requests::{GroupReconnection, LastRequest, Reconnection};
-pub use client::status::{EngineProcesses, EngineStatus, GroupStatus, ObserverStatus};
+pub use client::status::{EngineMonitor, EngineProcesses, EngineStatus, GroupStatus, ObserverStatus};
 pub use client::trainer::Trainer;
 pub use engine::config::{CheckpointConfig, EngineConfig};
 pub use engine::serving::Engine;

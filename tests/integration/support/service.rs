@@ -7,6 +7,7 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use crate::faulty_environments;
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{
@@ -127,6 +128,8 @@ pub fn play_role() {
                 }
             }
         }
+        ["faulty", ref arguments @ ..] => faulty_environments::program(arguments),
+        ["stuck", "trainer"] => faulty_environments::stuck_trainer(),
         _ => panic!("unknown role {role}"),
     }
 }

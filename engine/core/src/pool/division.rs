@@ -2,8 +2,9 @@
 
 use std::sync::PoisonError;
 
-use super::drawn_scene::{DrawnScene, WrongFrame};
+use super::drawn_scene::DrawnScene;
 use super::env_slot::EnvSlot;
+use super::error::PoolError;
 use super::sync::{Mutex, lock};
 use super::threads::Threads;
 use crate::batch::BatchMut;
@@ -15,6 +16,9 @@ const ENVS_FOR_THREAD: usize = 16;
 
 /// Minimum number of environments for using workers. The calling thread finishes fewer before a worker joins.
 const ENVS_FOR_THREADS: usize = 64;
+
+/// The number of an environment, and its error.
+pub(super) type OfEnv = (usize, PoolError);
 
 /// Consecutive environments, with their drawn scenes and their rows of the batch.
 pub(super) struct EnvRange<'a, E: Environment> {
@@ -35,8 +39,8 @@ impl<E: Environment> EnvRange<'_, E> {
         self,
         num_envs: usize,
         threads: &Threads,
-        work: impl Fn(EnvRange<'_, E>) -> Result<(), WrongFrame> + Sync,
-    ) -> Result<(), WrongFrame> {
+        work: impl Fn(EnvRange<'_, E>) -> Result<(), OfEnv> + Sync,
+    ) -> Result<(), OfEnv> {
         let count = threads.count().min(num_envs / ENVS_FOR_THREAD);
         if count < 2 || num_envs < ENVS_FOR_THREADS {
             return work(self);
@@ -54,10 +58,10 @@ impl<E: Environment> EnvRange<'_, E> {
                     out: self.out.part(envs),
                 }
             };
-            let Err(wrong) = work(piece) else { return };
+            let Err(failed) = work(piece) else { return };
             let mut outcome = lock(&outcome);
-            if outcome.as_ref().err().is_none_or(|known: &WrongFrame| wrong.env < known.env) {
-                *outcome = Err(wrong);
+            if outcome.as_ref().err().is_none_or(|known: &OfEnv| failed.0 < known.0) {
+                *outcome = Err(failed);
             }
         });
         outcome.into_inner().unwrap_or_else(PoisonError::into_inner)

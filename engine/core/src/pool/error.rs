@@ -3,6 +3,7 @@
 use thiserror::Error;
 
 use super::drawn_scene::WrongFrame;
+use super::env_panic::EnvPanic;
 use super::seeding::MAX_TOTAL_ENVS;
 use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 use crate::batch::{BLOCK_BYTES, LayoutError, MAX_STACK};
@@ -11,7 +12,7 @@ use crate::random::EntropyError;
 
 /// A pool cannot be created, or a call fails.
 ///
-/// Except for [`PoolError::WrongFrame`], an error changes no environment and no batch.
+/// Except for [`PoolError::WrongFrame`] and [`PoolError::Panic`], an error changes no environment and no batch.
 #[derive(Debug, Error)]
 pub enum PoolError {
     /// The registry has no environment with this id.
@@ -139,6 +140,10 @@ pub enum PoolError {
     /// it draws in full.
     #[error(transparent)]
     WrongFrame(#[from] WrongFrame),
+    /// An environment panicked. Some environments have advanced, and the batch is incomplete. All environments must be reset before
+    /// any other call, unless the call changes none.
+    #[error(transparent)]
+    Panic(#[from] EnvPanic),
     /// The memory for a batch is too small.
     #[error("a batch must have at least {needed} blocks of {BLOCK_BYTES} bytes, got {given}")]
     BatchTooShort {

@@ -8,6 +8,7 @@ mod config;
 #[allow(unsafe_code)] // Threads step disjoint parts of the environments.
 mod division;
 mod drawn_scene;
+mod env_panic;
 mod env_slot;
 mod episodes;
 mod error;
@@ -26,6 +27,7 @@ pub use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 pub use autoreset::{Autoreset, UnknownAutoreset};
 pub use config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 pub use drawn_scene::WrongFrame;
+pub use env_panic::EnvPanic;
 pub use episodes::{NextOptions, RunningEpisode};
 pub use error::PoolError;
 pub use experts::{Experts, ExpertsError};
@@ -34,3 +36,5 @@ pub use registry::{NoExpert, Registry, RegistryError};
 pub use seeding::Seeding;
 pub use snapshot::{ResumeError, SNAPSHOT_VERSION, SavedEnv, SnapshotError};
 pub use threads::{StepTimes, Threads};
+
+pub(crate) use env_panic::message;

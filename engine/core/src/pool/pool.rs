@@ -5,7 +5,8 @@ use std::sync::Arc;
 use super::autoreset::Autoreset;
 use super::buffers::Buffers;
 use super::config::{OptionMap, PoolConfig, ResetRequest};
-use super::drawn_scene::{DrawSettings, FrameFormat, WrongFrame};
+use super::drawn_scene::{DrawSettings, FrameFormat};
+use super::env_panic::{EnvPanic, catch};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
 use super::registry::{Entry, Registry};
@@ -64,7 +65,8 @@ impl Pool {
         config.check(&entry.spec)?;
         let layout = batch_layout(&entry.spec, config.num_envs, config.contents())?;
         let entropy = PoolEntropy::draw(&config.seeding)?;
-        let envs = entry.envs(config, entropy)?;
+        let made = catch(|| entry.envs(config, entropy));
+        let envs = made.map_err(|message| EnvPanic { id: entry.spec.id, env: None, seed: None, message })??;
         Ok(Pool {
             entry: Arc::clone(entry),
             layout,
@@ -110,7 +112,8 @@ impl Pool {
     /// # Errors
     ///
     /// [`PoolError`] if `request` has the wrong number of flags or seeds, if the first reset omits an environment, if an option
-    /// is invalid, or if `batch` is too short. Except for [`PoolError::WrongFrame`], an error changes no environment.
+    /// is invalid, or if `batch` is too short. Except for [`PoolError::WrongFrame`] and [`PoolError::Panic`], an error changes no
+    /// environment.
     pub fn reset_with(
         &mut self,
         request: ResetRequest<'_>,
@@ -134,7 +137,7 @@ impl Pool {
         self.check_batch(batch)?;
         if let Some(options) = options {
             // Comes after all other checks, so that an error changes no environment.
-            self.envs.set_options_of(request, options)?;
+            catch(|| self.envs.set_options_of(request, options)).map_err(|message| self.panic(None, message))??;
         }
         self.write(batch, |envs, context, out| envs.reset(context, request, out))?;
         self.was_reset = true;
@@ -146,7 +149,8 @@ impl Pool {
     /// # Errors
     ///
     /// [`PoolError`] if the environments have not been reset, if `actions` has the wrong length or a number out of range, or if
-    /// `batch` is too short. Except for [`PoolError::WrongFrame`], an error advances no environment.
+    /// `batch` is too short. Except for [`PoolError::WrongFrame`] and [`PoolError::Panic`], an error advances
+    /// no environment.
     pub fn step(&mut self, actions: &[i32], batch: &mut [Block]) -> Result<(), PoolError> {
         if !self.was_reset {
             return Err(PoolError::NotReset);
@@ -166,7 +170,7 @@ impl Pool {
     fn write(
         &mut self,
         batch: &mut [Block],
-        write: impl FnOnce(&mut dyn AnyEnvs, WriteContext<'_>, BatchMut<'_>) -> Result<(), WrongFrame>,
+        write: impl FnOnce(&mut dyn AnyEnvs, WriteContext<'_>, BatchMut<'_>) -> Result<(), PoolError>,
     ) -> Result<(), PoolError> {
         self.check_batch(batch)?;
         let buffer = self.buffers.begin(&self.layout, batch);
@@ -174,7 +178,9 @@ impl Pool {
         let context = WriteContext { threads: &self.threads, buffer: buffer.index, draw };
         let (given, needed) = (batch.len(), self.layout.blocks());
         let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
-        write(&mut *self.envs, context, out)?;
+        let written = write(&mut *self.envs, context, out);
+        self.was_reset &= !matches!(written, Err(PoolError::Panic(_)));
+        written?;
         self.buffers.finish(buffer, &self.layout, batch);
         Ok(())
     }
@@ -206,7 +212,7 @@ impl Pool {
         if let Some(given) = sets.iter().flat_map(|set| &set.envs).find(|env| **env >= num_envs) {
             return Err(PoolError::NoSuchEnv { given: *given, num_envs });
         }
-        Ok(self.envs.set_options(sets)?)
+        Ok(catch(|| self.envs.set_options(sets)).map_err(|message| self.panic(None, message))??)
     }
 
     /// The seed and reset parameters of an environment's running episode.
@@ -255,7 +261,7 @@ impl Pool {
     /// ```
     pub fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
         self.check_env(env)?;
-        if self.was_reset { self.envs.snapshot(env) } else { Err(SnapshotError::NotReset) }
+        if self.was_reset { self.saved(env) } else { Err(SnapshotError::NotReset) }
     }
 
     /// Restores an environment from a snapshot of the same id, which may come from another pool with other reset parameters.
@@ -270,7 +276,7 @@ impl Pool {
     /// valid snapshot of this id. An error does not change the environment.
     pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
         self.check_env(env)?;
-        if self.was_reset { self.envs.restore(env, snapshot) } else { Err(SnapshotError::NotReset) }
+        if self.was_reset { self.load(env, snapshot) } else { Err(SnapshotError::NotReset) }
     }
 
     /// The state of all environments, from which [`resume`](Pool::resume) continues identically; `None` before the first reset.
@@ -299,8 +305,9 @@ impl Pool {
             return Ok(None);
         }
         let save = |env| {
-            let snapshot = self.envs.snapshot(env)?;
-            Ok(SavedEnv { snapshot, earlier_frames: self.envs.earlier_frames(env, self.frame) })
+            let snapshot = self.saved(env)?;
+            let earlier_frames = catch(|| self.envs.earlier_frames(env, self.frame));
+            Ok(SavedEnv { snapshot, earlier_frames: earlier_frames.map_err(|message| self.panic(Some(env), message))? })
         };
         (0..self.layout.num_envs()).map(save).collect::<Result<_, _>>().map(Some)
     }
@@ -320,11 +327,29 @@ impl Pool {
         let frame_bytes = self.frame.bytes();
         for (env, SavedEnv { snapshot, earlier_frames }) in saved.iter().enumerate() {
             let failed = |source| ResumeError::Environment { env, source };
-            self.envs.restore(env, snapshot).map_err(failed)?;
+            self.load(env, snapshot).map_err(failed)?;
             self.envs.restore_earlier_frames(env, earlier_frames, frame_bytes).map_err(failed)?;
         }
         self.was_reset = true;
         Ok(())
+    }
+
+    fn panic(&self, env: Option<usize>, message: String) -> EnvPanic {
+        let seed = env.and_then(|env| self.envs.running_episode(env).seed);
+        EnvPanic { id: self.entry.spec.id, env, seed, message }
+    }
+
+    /// A snapshot of an environment whose number is in range.
+    fn saved(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
+        catch(|| self.envs.snapshot(env)).map_err(|message| self.panic(Some(env), message))?
+    }
+
+    /// Restores an environment whose number is in range.
+    fn load(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
+        catch(|| self.envs.restore(env, snapshot)).map_err(|message| {
+            self.was_reset = false;
+            self.panic(Some(env), message)
+        })?
     }
 
     fn check_running(&self, env: usize) -> Result<(), PoolError> {
@@ -348,7 +373,7 @@ impl Pool {
     /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
     pub fn progress(&self, env: usize) -> Result<Vec<Progress>, PoolError> {
         self.check_running(env)?;
-        Ok(self.envs.progress(env))
+        Ok(catch(|| self.envs.progress(env)).map_err(|message| self.panic(Some(env), message))?)
     }
 
     /// The frame that one environment's observation shows, in the default format, whether or not batches contain frames. Draws it
@@ -371,7 +396,8 @@ impl Pool {
     pub fn frame(&self, env: usize) -> Result<Vec<u8>, PoolError> {
         self.check_running(env)?;
         self.spec().frame.ok_or(PoolError::NoFrame { id: self.spec().id })?;
-        Ok(self.envs.frame(env, FrameFormat::new(self.spec(), None)))
+        let format = FrameFormat::new(self.spec(), None);
+        Ok(catch(|| self.envs.frame(env, format)).map_err(|message| self.panic(Some(env), message))?)
     }
 
     /// The ground-truth view of one environment, with what is hidden from the agent, at 4 times the width and height of the frame.
@@ -382,7 +408,7 @@ impl Pool {
     pub fn ground_truth_view(&mut self, env: usize) -> Result<Picture, PoolError> {
         self.check_running(env)?;
         let shape = self.spec().frame.ok_or(PoolError::NoFrame { id: self.spec().id })?;
-        Ok(self.envs.ground_truth_view(env, shape))
+        Ok(catch(|| self.envs.ground_truth_view(env, shape)).map_err(|message| self.panic(Some(env), message))?)
     }
 
     /// Sets the animations of an environment's ground-truth view as if [`ground_truth_view`](Self::ground_truth_view) had been
@@ -394,7 +420,6 @@ impl Pool {
     /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
     pub fn align_ground_truth_view(&mut self, env: usize) -> Result<(), PoolError> {
         self.check_running(env)?;
-        self.envs.align_ground_truth_view(env);
-        Ok(())
+        Ok(catch(|| self.envs.align_ground_truth_view(env)).map_err(|message| self.panic(Some(env), message))?)
     }
 }

@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::env_panic::EnvPanic;
 use super::seeding::SavedSeeds;
 use crate::envs::{InvalidState, ParameterError};
 use crate::random::Generator;
@@ -69,7 +70,7 @@ impl<S: DeserializeOwned> Saved<S> {
     }
 }
 
-/// A snapshot cannot be taken or restored. The environment has not changed.
+/// A snapshot cannot be taken or restored. Except for [`SnapshotError::Panic`], the environment has not changed.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
     /// The pool has no environment with this number.
@@ -120,6 +121,9 @@ pub enum SnapshotError {
     /// The environment cannot be in the snapshot's state.
     #[error("the snapshot's content is not valid: {0}")]
     State(#[from] InvalidState),
+    /// The environment panicked. After a restore, all environments must be reset before any other call.
+    #[error(transparent)]
+    Panic(#[from] EnvPanic),
 }
 
 /// The state of one environment of a pool, as [`Pool::save`](super::Pool::save) returns it.

@@ -1,5 +1,6 @@
 //! The environments of a pool, all of one family.
 
+use std::cell::Cell;
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::sync::Arc;
@@ -10,6 +11,7 @@ use super::autoreset::Autoreset;
 use super::config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 use super::division::EnvRange;
 use super::drawn_scene::{DrawSettings, DrawnScene, FrameFormat, WrongFrame, draw_in_full};
+use super::env_panic::{EnvPanic, catch};
 use super::env_slot::{EnvSlot, OptionSet};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
@@ -40,7 +42,7 @@ pub(super) trait AnyEnvs: Send + Sync {
         autoreset: Autoreset,
         actions: &[i32],
         out: BatchMut<'_>,
-    ) -> Result<(), WrongFrame>;
+    ) -> Result<(), PoolError>;
 
     /// Resets environments as `request` says and writes every environment's row.
     fn reset(
@@ -48,7 +50,7 @@ pub(super) trait AnyEnvs: Send + Sync {
         context: WriteContext<'_>,
         request: ResetRequest<'_>,
         out: BatchMut<'_>,
-    ) -> Result<(), WrongFrame>;
+    ) -> Result<(), PoolError>;
 
     /// Sets reset parameters for environments, from their next episode on. The environments' numbers must be in range.
     fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), ParameterError>;
@@ -146,26 +148,39 @@ impl<E: Environment> TypedEnvs<E> {
         context: WriteContext<'_>,
         out: BatchMut<'_>,
         play: impl Fn(usize, &mut EnvSlot<E>, &mut BatchMut<'_>, usize) + Sync,
-    ) -> Result<(), WrongFrame> {
+    ) -> Result<(), PoolError> {
         while self.drawn.len() <= context.buffer {
             self.drawn.push((0..self.slots.len() * self.stack).map(|_| DrawnScene::unknown()).collect());
         }
         let (stack, num_envs) = (self.stack, self.slots.len());
         let drawn = DisjointSlice::new(&mut self.drawn[context.buffer]);
         let all = EnvRange { first: 0, slots: DisjointSlice::new(&mut self.slots), drawn, stack, out };
-        all.for_each_piece(num_envs, context.threads, |piece| {
+        let id = self.spec.id;
+        let played = all.for_each_piece(num_envs, context.threads, |piece| {
             let EnvRange { first, mut slots, mut drawn, mut out, .. } = piece;
-            let envs = slots.as_mut().iter_mut().zip(drawn.as_mut().chunks_exact_mut(stack));
-            for (row, (slot, drawn)) in envs.enumerate() {
-                play(first + row, slot, &mut out, row);
-                let frames = out.observation.row(row);
-                if !frames.is_empty() {
-                    let outcome = slot.draw(drawn, context.draw, frames);
-                    outcome.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
+            let slots = slots.as_mut();
+            let current = Cell::new(0);
+            let played = catch(|| {
+                let envs = slots.iter_mut().zip(drawn.as_mut().chunks_exact_mut(stack));
+                for (row, (slot, drawn)) in envs.enumerate() {
+                    current.set(row);
+                    play(first + row, slot, &mut out, row);
+                    let frames = out.observation.row(row);
+                    if !frames.is_empty() {
+                        let outcome = slot.draw(drawn, context.draw, frames);
+                        outcome.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
+                    }
                 }
+                Ok::<_, WrongFrame>(())
+            });
+            let (row, env) = (current.get(), first + current.get());
+            match played {
+                Ok(played) => played.map_err(PoolError::from),
+                Err(message) => Err(EnvPanic { id, env: Some(env), seed: slots[row].episode_seed, message }.into()),
             }
-            Ok(())
-        })
+            .map_err(|error| (env, error))
+        });
+        played.map_err(|(_, error)| error)
     }
 
     /// The assets for these options: shared with an environment that has the same options, or new.
@@ -190,7 +205,7 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
         autoreset: Autoreset,
         actions: &[i32],
         out: BatchMut<'_>,
-    ) -> Result<(), WrongFrame> {
+    ) -> Result<(), PoolError> {
         let branches = self.spec.action_space.width();
         self.write(context, out, |env, slot, out, row| {
             slot.step(autoreset, context.draw, &actions[env * branches..][..branches], out, row);
@@ -202,7 +217,7 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
         context: WriteContext<'_>,
         request: ResetRequest<'_>,
         out: BatchMut<'_>,
-    ) -> Result<(), WrongFrame> {
+    ) -> Result<(), PoolError> {
         self.write(context, out, |env, slot, out, row| {
             match request {
                 ResetRequest::All => slot.start_episode(None),

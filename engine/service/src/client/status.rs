@@ -226,6 +226,17 @@ pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize
     EngineActivity::NotTaken { process: engine.head.process }
 }
 
+/// Shows what an engine of this process is doing, while another thread runs it.
+#[derive(Debug)]
+pub struct EngineMonitor(pub(crate) StatusReader);
+
+impl EngineMonitor {
+    /// The request that the engine is executing; [`EngineActivity::NotTaken`] if there is none.
+    pub fn activity(&self) -> EngineActivity {
+        activity(Some(&self.0), 0, 0, u64::MAX)
+    }
+}
+
 /// What the engine is doing while an observer waits for a batch of a group.
 pub(crate) fn observed_activity(status: Option<&StatusReader>, group: usize) -> EngineActivity {
     // No trainer has the number 0.

@@ -195,7 +195,7 @@ impl Group {
             RequestKind::Snapshot => return self.write_snapshot(env, payload),
             RequestKind::Restore => {
                 let done = self.pool.restore(env, snapshot).map(|()| Outcome::Snapshot { bytes: 0 });
-                return done.map_err(|e| (Rejection::Snapshot, e.to_string()));
+                return done.map_err(rejected_snapshot);
             }
             RequestKind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
             RequestKind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
@@ -207,6 +207,7 @@ impl Group {
         };
         done.map_err(|e| match e {
             PoolError::NotReset => (Rejection::NotReset, e.to_string()),
+            PoolError::Panic(e) => (Rejection::Panic, e.to_string()),
             e => (Rejection::Pool, e.to_string()),
         })?;
         if kind == RequestKind::SetOptions {
@@ -271,7 +272,7 @@ impl Group {
 
     /// Overwrites the batch in `payload` with a snapshot of an environment.
     fn write_snapshot(&self, env: usize, payload: &mut [Block]) -> Result<Outcome, Rejected> {
-        let snapshot = self.pool.snapshot(env).map_err(|e| (Rejection::Snapshot, e.to_string()))?;
+        let snapshot = self.pool.snapshot(env).map_err(rejected_snapshot)?;
         if snapshot.len() > SNAPSHOT_BYTES {
             let text = format!(
                 "snapshot must have at most {SNAPSHOT_BYTES} bytes, got {}; use reset parameters with shorter lists",
@@ -347,6 +348,11 @@ impl RequestData {
         };
         Ok(kind)
     }
+}
+
+fn rejected_snapshot(error: SnapshotError) -> Rejected {
+    let reason = if matches!(error, SnapshotError::Panic(_)) { Rejection::Panic } else { Rejection::Snapshot };
+    (reason, error.to_string())
 }
 
 /// The first `length` elements, or an empty slice if there are fewer.

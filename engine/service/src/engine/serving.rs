@@ -9,6 +9,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use serde_json::json;
 
+use crate::client::status::EngineMonitor;
 use crate::engine::checkpoint::{CheckpointHead, Checkpointer};
 use crate::engine::config::EngineConfig;
 use crate::engine::group::{Group, Outcome, Rejected, RequestSample};
@@ -198,6 +199,11 @@ impl Engine {
         &self.specification
     }
 
+    /// Looks at what the engine is doing from another thread; `None` if its status cannot be opened.
+    pub fn monitor(&self) -> Option<EngineMonitor> {
+        self.status.reader().map(EngineMonitor)
+    }
+
     /// Batches that each group has returned, including those before the checkpoint that the engine resumed from.
     pub fn steps(&self) -> Vec<u64> {
         (0..self.groups.len()).map(|group| self.status.step(group)).collect()
@@ -209,7 +215,7 @@ impl Engine {
     ///
     /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, since no trainer can
     /// find the engine any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine
-    /// cannot continue. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; earlier failures are
+    /// cannot continue. [`ServiceError::Panic`] if an environment panics; the trainer is told as well. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; earlier failures are
     /// logged and tried again later. A trainer's faults are not errors: its requests are rejected.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
@@ -318,8 +324,15 @@ impl Engine {
             Ok(Outcome::Snapshot { bytes }) => header.set_snapshot(*bytes),
             Err((reason, _)) => header.set_rejection(*reason, text),
         }
-        // Before the response is sent, so that a trainer that has it sees it in the status.
-        self.status.end(number, step, outcome.as_ref().ok());
+        let panic = match &outcome {
+            Err((Rejection::Panic, panic)) => Some(ServiceError::Panic { group: number, panic: panic.clone() }),
+            _ => None,
+        };
+        // Before the response is sent, so that a trainer that has it sees it in the status. A request that panicked stays
+        // unfinished there: it was played in part.
+        if panic.is_none() {
+            self.status.end(number, step, outcome.as_ref().ok());
+        }
         // A trainer that dies at this moment must not end the engine.
         let sent = match outcome {
             Ok(Outcome::Batch { .. }) => self.groups[number].send_batch(batch),
@@ -333,7 +346,7 @@ impl Engine {
         if receivers == 0 && matches!(outcome, Ok(Outcome::Batch { .. })) {
             self.status.update_group(number, |group| group.undelivered += 1);
         }
-        Ok(())
+        panic.map_or(Ok(()), Err)
     }
 
     /// Saves a checkpoint and writes the steps of the groups into the payload of the response.
