@@ -13,7 +13,9 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 from rich.console import Console
+from rich.text import Text
 
+from endless_gym.printable import printable, printable_lines
 from endless_gym_agents import ranges
 
 T = TypeVar("T")
@@ -52,7 +54,17 @@ def drop_lost_outputs() -> None:
 
 
 class Terminal(Console):
-    """A console on standard output that goes silent when nobody can read it any more, so that the work goes on."""
+    """A console for text from files and other processes, without markup and with control characters escaped. It goes silent when
+    nobody can read it any more, so that the work goes on.
+    """
+
+    def __init__(self, **arguments: Any) -> None:
+        """As for `Console`."""
+        super().__init__(markup=False, emoji=False, **{"highlight": False} | arguments)
+
+    def render_str(self, text: str, **arguments: Any) -> Text:
+        """As `Console.render_str`, which all texts and the cells of tables pass."""
+        return super().render_str(printable_lines(text), **arguments)
 
     def print(self, *objects: Any, **arguments: Any) -> None:
         """Print as `Console.print`, without wrapping lines."""
@@ -82,10 +94,10 @@ def run(name: str, work: Callable[[], object]) -> int:
         print(f"{name}: stopped", file=sys.stderr)
         return INTERRUPTED
     except ModuleNotFoundError as error:
-        print(f"{name}: {error.name} is not installed", file=sys.stderr)
+        print(f"{name}: {printable(error.name)} is not installed", file=sys.stderr)
         return 1
     except (ValueError, OSError) as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{name}: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         return 1
     return 0
 

@@ -16,7 +16,6 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from rich.console import Console
 
 from endless_gym.specs import spec
 from endless_gym.vector import EndlessVectorEnv
@@ -113,8 +112,8 @@ def execute(arguments: EnjoyArguments) -> None:
     video.check(arguments.out)
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)
-    console = Console()
-    with Console(stderr=True).status(f"playing {agent.settings.env}"):
+    console = command.Terminal()
+    with command.Terminal(stderr=True).status(f"playing {agent.settings.env}"):
         video.write(
             arguments.out, recorder.frames(arguments.seeds), arguments.fps or spec(agent.settings.env).render_fps
         )

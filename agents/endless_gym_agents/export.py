@@ -24,6 +24,7 @@ import tyro
 from safetensors.torch import save, save_file
 
 from endless_gym.create import make_vec
+from endless_gym.printable import printable
 from endless_gym.specs import spec
 from endless_gym_agents import command
 from endless_gym_agents.agent import Agent
@@ -173,7 +174,7 @@ def execute(arguments: ExportArguments) -> None:
             tensor.copy_(tensor.bfloat16())
         evaluation = evaluations(agent)
         arguments.out.write_bytes(export(checkpoint, evaluation))
-        print(f"{arguments.out}: {arguments.out.stat().st_size} bytes, {evaluation}")
+        print(f"{printable(arguments.out)}: {arguments.out.stat().st_size} bytes, {evaluation}")
     if arguments.vectors is not None:
         vectors = record_vectors(agent, arguments.vector_steps)
         arguments.vectors.write_text(json.dumps(vectors, separators=(",", ":")) + "\n")

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from rich.console import Console
 
+from endless_gym.printable import printable
 from endless_gym_agents import command, metrics
 from endless_gym_agents.curves import (
     AXES,
@@ -227,8 +227,10 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
         changed = [curve.label for curve in mine if ", " in curve.label]
         if paper and changed:
             print(
-                f"endless-plot: {env}: {'; '.join(changed)} is another task than the paper's, with which its score cannot be "
-                "compared; omit the paper's curves with --published",
+                printable(
+                    f"endless-plot: {env}: {'; '.join(changed)} is another task than the paper's, with which its score "
+                    "cannot be compared; omit the paper's curves with --published"
+                ),
                 file=sys.stderr,
             )
         curves = mine + paper
@@ -238,7 +240,7 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
 
 def execute(arguments: PlotArguments) -> None:
     """Draw all requested plots, and print their paths."""
-    console = Console()
+    console = command.Terminal()
     for plot in draw_all(arguments):
         console.print(f"{plot}, with its data in .csv and .json", soft_wrap=True)
 

@@ -20,7 +20,6 @@ from typing import Annotated
 
 import torch
 import tyro
-from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
@@ -231,7 +230,7 @@ def execute(arguments: ProbeArguments) -> None:
         values = {"env": env_spec.id, "steps": len(recording.truth), "scores": [asdict(score) for score in scores]}
         print(json.dumps(values, indent=1))
         return
-    tables.show(table(f"{env_spec.id}, {len(recording.truth):,} steps", scores), Console())
+    tables.show(table(f"{env_spec.id}, {len(recording.truth):,} steps", scores), command.Terminal())
 
 
 def main() -> int:

@@ -187,7 +187,7 @@ def execute(arguments: EvalArguments) -> None:
     """Evaluate the checkpoints, and write or print the results."""
     if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
         raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
-    messages, start = Console(stderr=True), time.monotonic()
+    messages, start = command.Terminal(stderr=True), time.monotonic()
     failed: list[str] = []
     found = evaluate_runs(arguments, messages, failed)
     experiments = [experiment for experiment in found if experiment.common_steps()]
@@ -207,7 +207,7 @@ def execute(arguments: EvalArguments) -> None:
     else:
         if arguments.json:
             Path(arguments.json).write_text(json.dumps(written) + "\n")
-        console = Console()
+        console = command.Terminal()
         for experiment in experiments:
             tables.show(table(experiment), console)
     if failed:

@@ -25,6 +25,7 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
+from endless_gym.printable import printable
 from endless_gym_agents import command, ray_session, tables
 from endless_gym_agents.clock import duration
 from endless_gym_agents.experiments import definitions, planning, running, running_ray
@@ -103,7 +104,7 @@ def execute(arguments: ReproduceArguments) -> None:
         ValueError: An argument is invalid, a folder has another run, or a run failed.
         KeyboardInterrupt: The runs were stopped.
     """
-    console, scale = command.Terminal(highlight=False), planning.read_scale(arguments.scale)
+    console, scale = command.Terminal(), planning.read_scale(arguments.scale)
     every = arguments.names == ("all",) or (arguments.list and not arguments.names)
     experiments = [definitions.load(name) for name in (definitions.names() if every else arguments.names)]
     if not experiments:
@@ -125,7 +126,7 @@ def execute(arguments: ReproduceArguments) -> None:
     if arguments.dry_run:
         for number, job in enumerate(job for job in planned if job.state() != "done"):
             for line in planning.commands(job, machine.device, machine.engine_threads):
-                print(running.shown(line, machine, number))
+                print(printable(running.shown(line, machine, number)))
         return
     if arguments.status:
         seconds = planning.seconds_left(planned)

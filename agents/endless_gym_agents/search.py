@@ -92,7 +92,7 @@ def execute(arguments: SearchArguments) -> None:
     if arguments.ray:
         # Tune imports pyarrow, which Ray alone does not install.
         ray_session.check_installed("pyarrow")
-    trials = Trials(arguments, command.Terminal(highlight=False))
+    trials = Trials(arguments, command.Terminal())
     done, left = trials.remaining()
     trials.say(f"{done} trials done, {left} remaining, in {trials.folder}; Ctrl-C stops the search")
     try:

@@ -269,7 +269,7 @@ class Trials:
                 run = self.run_folder(asked.number, asked.user_attrs)
                 settings = with_choices(self.arguments.settings, choices)
                 trial = Trial(self, asked, replace(settings, run=str(run), stop_when_learnt=False), lock)
-                self.say(f"[bold]trial {trial.number}[/]: {self.changed(choices) or 'initial settings'}")
+                self.say(f"trial {trial.number}: {self.changed(choices) or 'initial settings'}")
                 try:
                     trial.settings = trial.settings.validated()
                 except ValueError as error:

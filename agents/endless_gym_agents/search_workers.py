@@ -115,5 +115,5 @@ def _worker(arguments: SearchArguments, end: float, machine: running.Machine, sl
     os.setsid()
     if machine.gpus and arguments.settings.device in ("auto", "cuda"):
         os.environ["CUDA_VISIBLE_DEVICES"] = machine.gpus[slot % len(machine.gpus)]
-    trials = Trials(arguments, command.Terminal(highlight=False, file=sys.stdout), end)
+    trials = Trials(arguments, command.Terminal(file=sys.stdout), end)
     sys.exit(command.run("endless-search", lambda: work(trials, machine.engine_threads)))

@@ -45,7 +45,7 @@ def show(made: Table, console: Console) -> None:
 def _lines(made: Table) -> RenderableType:
     """The title, a block of lines for each row, and the caption."""
     cells = [list(column.cells) for column in made.columns]
-    parts: list[RenderableType] = [Text(made.title)] if isinstance(made.title, str) else []
+    parts: list[RenderableType] = [made.title] if isinstance(made.title, str) else []
     for row in zip(*cells, strict=True):
         block = Table.grid(padding=(0, 2, 0, 0))
         block.add_column(no_wrap=True, min_width=max(len(str(column.header)) for column in made.columns))
@@ -53,4 +53,4 @@ def _lines(made: Table) -> RenderableType:
         for column, cell in zip(made.columns, row, strict=True):
             block.add_row(column.header, cell)
         parts += [Text(), block]
-    return Group(*parts, *([Text(), Text(made.caption)] if isinstance(made.caption, str) else []))
+    return Group(*parts, *([Text(), made.caption] if isinstance(made.caption, str) else []))

@@ -9,6 +9,8 @@ import subprocess
 import threading
 from collections import deque
 
+from endless_gym.printable import printable
+
 _logger = logging.getLogger("endless_gym.engine")
 
 #: A line as the program logs it: time, level, target and text.
@@ -42,7 +44,7 @@ class EngineLog:
         if stream is None:
             return
         for raw in stream:
-            line = raw.decode(errors="replace").rstrip()
+            line = printable(raw.decode(errors="replace").rstrip())
             if found := _LINE.fullmatch(line):
                 _logger.log(_LEVELS[found[1]], "engine %d: %s", self._process.pid, found[2])
             else:

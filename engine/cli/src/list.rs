@@ -6,7 +6,7 @@ use endless_gym_core::pool::Registry;
 use serde_json::json;
 
 use super::failure::Failure;
-use super::output::{self, print, print_json, table};
+use super::output::{self, print, print_coloured, print_json, table};
 use super::picture::{When, picture};
 
 /// Arguments of `endless list`.
@@ -30,7 +30,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
             match () {
                 _ if args.json => print_json(&as_json(spec)),
                 _ if args.picture.applies() && spec.frame.is_some() => {
-                    print(format_args!("{}\n{}", picture(registry, spec, output::width())?, description(spec)))
+                    print_coloured(format_args!("{}\n{}", picture(registry, spec, output::width())?, description(spec)))
                 }
                 _ => print(description(spec)),
             }

@@ -1,8 +1,10 @@
 //! Standard output and standard error: tables and numbers for people, JSON for programs.
 
+use std::fmt::Display;
 use std::io::{self, ErrorKind, IsTerminal, Write};
 
 use comfy_table::{ColumnConstraint, ContentArrangement, LineStyle, Table, TableStyle};
+use endless_gym_core::printable;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use terminal_size::{Width, terminal_size_of};
@@ -51,8 +53,15 @@ pub fn width() -> u16 {
     terminal_size_of(io::stdout()).map_or(PIPE_WIDTH, |(Width(columns), _)| columns)
 }
 
-/// Prints `text` and a newline to standard output.
-pub fn print(text: impl std::fmt::Display) -> Result<(), Failure> {
+/// Prints `text` and a newline to standard output. Names and other text of one line that come from files or other processes must be
+/// [`printable`] before, since here a line break starts a new line.
+pub fn print(text: impl Display) -> Result<(), Failure> {
+    let text = text.to_string();
+    print_coloured(text.split('\n').map(printable).collect::<Vec<_>>().join("\n"))
+}
+
+/// Like [`print()`], with the terminal's escape sequences in `text`, which must be this program's own.
+pub fn print_coloured(text: impl Display) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     check(writeln!(stdout, "{text}").and_then(|()| stdout.flush()))
 }
@@ -65,7 +74,7 @@ pub fn clear() -> Result<(), Failure> {
 
 /// Replaces the last line of the terminal on standard output with `text`, cut to the terminal's width.
 pub fn replace_line(text: &str) -> Result<(), Failure> {
-    let fitting: String = text.chars().take(usize::from(width()).saturating_sub(1)).collect();
+    let fitting: String = printable(text).chars().take(usize::from(width()).saturating_sub(1)).collect();
     let mut stdout = io::stdout().lock();
     check(write!(stdout, "\r\x1b[2K{fitting}").and_then(|()| stdout.flush()))
 }
@@ -75,9 +84,24 @@ pub fn end_line(is_live: bool) -> Result<(), Failure> {
     if is_live { print("") } else { Ok(()) }
 }
 
-/// Prints one JSON document to standard output.
+/// Prints one JSON document to standard output, with all characters but those of ASCII escaped.
 pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
-    print(serde_json::to_string_pretty(value)?)
+    print(ascii(&serde_json::to_string_pretty(value)?))
+}
+
+/// Prints one JSON document in one line.
+pub fn print_json_line(value: &impl Serialize) -> Result<(), Failure> {
+    print(ascii(&serde_json::to_string(value)?))
+}
+
+/// JSON in ASCII. JSON itself allows control characters above it.
+fn ascii(json: &str) -> String {
+    let mut units = [0; 2];
+    let mut text = |c: char| match c {
+        ' '..='~' | '\n' => c.to_string(),
+        _ => c.encode_utf16(&mut units).iter().map(|unit| format!("\\u{unit:04x}")).collect(),
+    };
+    json.chars().map(&mut text).collect()
 }
 
 /// Prints the text of `--help` or `--version` to standard output.
@@ -85,9 +109,9 @@ pub fn print_help(help: &clap::Error) -> Result<(), Failure> {
     check(help.print().and_then(|()| io::stdout().flush()))
 }
 
-/// Prints an error or a warning to standard error. Without standard error, the exit status is the only remaining way to report.
-pub fn print_error(error: impl std::fmt::Display) {
-    let _ = writeln!(io::stderr(), "endless: {error}");
+/// Prints an error or a warning in one line to standard error. Without standard error, the exit status is the only remaining way to report.
+pub fn print_error(error: impl Display) {
+    let _ = writeln!(io::stderr(), "endless: {}", printable(error));
 }
 
 /// Turns an error of standard output into a failure. A closed pipe is not an error: in `endless list | head -1`, the
@@ -136,6 +160,14 @@ mod tests {
         let lines = "engine       a\nenvironment  Endless-SearingSpotlights-v0\nsteps        123,456,789\n\n\
                      engine       b\nenvironment  MysteryPath-v0\nsteps        7";
         assert_eq!(fit_into(made(), 45), lines);
+    }
+
+    #[test]
+    fn json_is_ascii_and_keeps_its_values() {
+        let given = "\x1b\u{9b}\u{202e}🙂\"\\é\n\x7f";
+        let text = ascii(&serde_json::to_string(given).unwrap());
+        assert!(text.is_ascii() && !text.contains(char::is_control), "{text}");
+        assert_eq!(serde_json::from_str::<String>(&text).unwrap(), given);
     }
 
     #[test]

@@ -139,7 +139,7 @@ fn watch(engine: &Engine, config: &EngineConfig, stop: &'static AtomicBool) -> R
     };
     let end = move |text| {
         print_error(text);
-        replace_by_cleanup(&namespace)
+        replace_by_cleanup(&namespace);
     };
     stop::watch(stop, stuck, end).map(Some)
 }

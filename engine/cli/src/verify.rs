@@ -1,8 +1,9 @@
 //! `endless verify`.
 
-use endless_gym_core::pool::Registry;
 use std::path::PathBuf;
 
+use endless_gym_core::pool::Registry;
+use endless_gym_core::printable;
 use endless_gym_core::trace::{Trace, replay};
 use rayon::prelude::*;
 use serde_json::json;
@@ -67,7 +68,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<bool, Failure> {
                 "verdict": text,
             }));
         } else {
-            print(format_args!("{name}: {text}"))?;
+            print(printable(format_args!("{name}: {text}")))?;
         }
     }
     if args.json {

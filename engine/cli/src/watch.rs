@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::failure::Failure;
 use super::options::seconds;
-use super::output::{end_line, grouped, print, replace_line};
+use super::output::{end_line, grouped, print, print_json_line, replace_line};
 use super::stop;
 
 /// Seconds between updates of the line in a terminal, and between lines elsewhere, unless `--interval` sets them.
@@ -174,7 +174,7 @@ fn show(
     let rate = statistics.rate();
     let (means, idle) = (statistics.episodes.means(), statistics.last.elapsed());
     if args.json {
-        return print(json!({
+        return print_json_line(&json!({
             "service": service,
             "environment": id,
             "steps_per_second": rate,

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
+from endless_gym.printable import printable
 from endless_gym.recording.recorder import Recording, record
 from endless_gym.specs import Frames
 
@@ -41,7 +42,7 @@ def run(name: str, work: Callable[[], object]) -> int:
         print(f"{name}: stopped, and wrote nothing", file=sys.stderr)
         return INTERRUPTED
     except (ImportError, OSError, TypeError, ValueError) as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{name}: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         return FAILURE
     finally:
         for number, handler in zip(signals, before, strict=True):
@@ -63,7 +64,7 @@ def show(recording: Recording, as_json: bool) -> None:
     print(f"{recording.episodes:,} episodes, {recording.steps:,} steps, {recording.megabytes:,.1f} MB")
     print(f"mean return {recording.mean_return:.3f}, mean length {recording.mean_length:.1f}")
     print(f"{recording.seconds:.1f} s, {per_minute:,.0f} episodes per minute")
-    print(f"{recording.path}\nminari.load_dataset({recording.dataset!r})")
+    print(f"{printable(recording.path)}\nminari.load_dataset({recording.dataset!r})")
 
 
 @contextmanager

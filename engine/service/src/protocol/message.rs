@@ -5,6 +5,7 @@
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym_core::batch::{Block, LAYOUT_VERSION};
+use endless_gym_core::printable;
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::error::Rejection;
@@ -213,7 +214,7 @@ pub(crate) fn write_text(payload: &mut [Block], text: &str) -> usize {
 /// The explanation of a rejection; empty if its length is beyond the payload.
 pub(crate) fn read_text(payload: &[Block], bytes: usize) -> String {
     let memory: &[u8] = bytemuck::cast_slice(payload);
-    String::from_utf8_lossy(memory.get(..bytes).unwrap_or_default()).into_owned()
+    printable(String::from_utf8_lossy(memory.get(..bytes).unwrap_or_default()))
 }
 
 #[cfg(test)]
