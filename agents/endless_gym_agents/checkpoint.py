@@ -25,7 +25,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from endless_gym.specs import spec
-from endless_gym_agents import ranges
+from endless_gym_agents import ranges, regular
 from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.settings import Settings, Transformer, from_dict
 
@@ -38,6 +38,9 @@ SETTINGS = "settings.json"
 FOLDER = "checkpoints"
 LAST = "last.pt"
 RUST_SUFFIX = ".safetensors"
+
+#: Longest header of such a file in bytes: far more than a network needs, and few enough to read at once.
+_MAX_HEADER = 4 << 20
 
 
 @dataclass
@@ -156,7 +159,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     if file.suffix == RUST_SUFFIX:
         state = _read_of_rust(file)
     else:
-        with file.open("rb") as content:
+        with regular.opened(file) as content:
             state = _read(content, file)
     if (version := state.get("version")) != CHECKPOINT_VERSION:
         raise ValueError(
@@ -211,6 +214,11 @@ def _read(content: BinaryIO, file: Path) -> dict[str, Any]:
 
 def _read_of_rust(file: Path) -> dict[str, Any]:
     """As `_read`, of a checkpoint of `endless learn`, without what only that program needs to resume."""
+    with regular.opened(file) as content:
+        if (header := int.from_bytes(content.read(8), "little")) > _MAX_HEADER:
+            raise ValueError(
+                f"{file} is not a checkpoint: its header must have at most {_MAX_HEADER} bytes, and claims {header}"
+            )
     try:
         with safe_open(file, "pt") as content:
             metadata = content.metadata() or {}
@@ -288,6 +296,6 @@ def read_settings(run: str | Path) -> Settings:
     if not (Path(run) / SETTINGS).exists():
         raise FileNotFoundError(f"no run in {run}; expected a folder with {SETTINGS}, as endless-train writes it")
     try:
-        return from_dict(json.loads((Path(run) / SETTINGS).read_text()))
+        return from_dict(json.loads(regular.text(Path(run) / SETTINGS)))
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{Path(run) / SETTINGS} is not of this version of endless-train ({error})") from None

@@ -12,6 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
+from endless_gym_agents import regular
 from endless_gym_agents.clock import duration
 from endless_gym_agents.command import Terminal
 from endless_gym_agents.settings import Settings, to_dict
@@ -38,7 +39,7 @@ class Logger:
         """
         from torch.utils.tensorboard import SummaryWriter
 
-        self.console = Terminal(highlight=False)
+        self.console = Terminal()
         self._updates = settings.ppo.updates
         self._recent: deque[float] = deque(maxlen=20)
         self._has_warned = False
@@ -84,7 +85,8 @@ class Logger:
         self.console.print(
             f"[bold]{update:>5}[/]/{self._updates} {steps:>11,} steps {metrics['steps_per_second']:>8,.0f}/s "
             f"{duration(left):>12} left  "
-            f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]"
+            f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]",
+            markup=True,
         )
 
         if not self._has_warned and left > _LONG:
@@ -131,7 +133,7 @@ def means(episodes: Collection[dict[str, float]]) -> dict[str, float]:
 def read_progress(run: Path) -> list[dict[str, Any]]:
     """The rows of `progress.jsonl`, one per update; an incomplete last line, from a killed process, is ignored."""
     rows = []
-    for line in (run / PROGRESS).read_text().splitlines():
+    for line in regular.text(run / PROGRESS).splitlines():
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
@@ -159,7 +161,7 @@ def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:
     kept = run / "wandb-id.txt"
     if not kept.exists():
         kept.write_text(secrets.token_hex(4))
-    given: dict[str, Any] = {"id": kept.read_text(), "name": run.name, "dir": str(run), "config": to_dict(settings)}
+    given: dict[str, Any] = {"id": regular.text(kept), "name": run.name, "dir": str(run), "config": to_dict(settings)}
     try:
         return wandb.init(project="endless-gym", resume="allow", **given)
     except wandb.Error as error:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from endless_gym_agents import metrics
+from endless_gym_agents import metrics, regular
 from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.settings import Recurrence, Settings
 from endless_gym_agents.statistics import Summary, summarise
@@ -178,7 +178,7 @@ def read(file: Path) -> list[Experiment]:
         ValueError: The file has another format.
     """
     try:
-        written = json.loads(file.read_text())["experiments"]
+        written = json.loads(regular.text(file))["experiments"]
         return [
             Experiment(one["env"], one["label"], one["options"], [Run(**run) for run in one["runs"]]) for one in written
         ]

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+from endless_gym.printable import printable
 from endless_gym_agents import checkpoint
 from endless_gym_agents.settings import Settings
 
@@ -40,10 +41,14 @@ def opened(settings: Settings, restarts: int = 0) -> Iterator[tuple[str, bool]]:
         RunInUse: Another process trains in the folder.
         FileExistsError: The folder of a new run contains another run.
         FileNotFoundError: There is no run to resume.
-        ValueError: The run was restarted, and its folder has no fixed name.
+        ValueError: The run was restarted, and its folder has no fixed name; or the name is not UTF-8.
     """
     if restarts and not (settings.run or settings.resume):
         raise ValueError("a run that torchrun starts again needs --run, to find its checkpoint; got no folder")
+    try:
+        f"{settings.run}{settings.resume}".encode()
+    except UnicodeEncodeError:
+        raise ValueError("the name of a run's folder must be UTF-8, since the settings of the run contain it") from None
     if settings.resume:
         checkpoint.read_settings(settings.resume)
     run = Path(settings.resume or settings.run) if settings.resume or settings.run else _new_folder(settings)
@@ -91,7 +96,7 @@ def locked(run: Path) -> Iterator[None]:
                 holder = file.read().strip() or "another process"
                 raise RunInUse(f"{run} is in use by {holder}; wait until it ends, or choose another folder") from None
             except OSError as error:  # The file system has no locks.
-                warnings.warn(f"{run} cannot be locked ({error}); start only one run in it", stacklevel=2)
+                warnings.warn(f"{printable(run)} cannot be locked ({error}); start only one run in it", stacklevel=2)
             if os.fstat(file.fileno()).st_nlink == 0:
                 continue  # The process that held the lock has removed the file.
             file.truncate(0)

@@ -35,6 +35,7 @@ mod snapshots;
 mod support;
 mod terminal;
 mod traces;
+mod untrusted_files;
 mod view;
 mod web_attacks;
 

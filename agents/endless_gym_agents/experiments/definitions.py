@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from endless_gym.specs import spec
+from endless_gym_agents import regular
 from endless_gym_agents.search_space import with_choices
 from endless_gym_agents.settings import PRESETS, Settings
 
@@ -167,7 +168,7 @@ def load(name: str) -> Experiment:
         file = Path(name)
         if not file.exists():
             raise FileNotFoundError(f"no such file: {file}; expected an experiment as JSON")
-        return parse(file.stem, file.read_text())
+        return parse(file.stem, regular.text(file))
     if name not in names():
         raise ValueError(f"experiment must be one of {', '.join(names())}, or a JSON file; got `{name}`")
     return parse(name, (resources.files(__package__) / f"{name}.json").read_text())

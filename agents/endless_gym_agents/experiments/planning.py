@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import torch
 
-from endless_gym_agents import checkpoint
+from endless_gym_agents import checkpoint, regular
 from endless_gym_agents.experiments.definitions import Evaluation, Experiment, Run, Value
 from endless_gym_agents.logs import PROGRESS, read_progress
 from endless_gym_agents.search_space import space
@@ -62,6 +62,7 @@ class Job:
         last = self.folder / checkpoint.FOLDER / checkpoint.LAST
         if self.updates_done() < self.updates or not last.exists():
             return False
+        regular.opened(last).close()
         return int(torch.load(last, map_location="cpu", weights_only=True, mmap=True)["update"]) >= self.updates
 
     def state(self) -> State:
@@ -79,7 +80,7 @@ def _complete(file: Path) -> bool:
     if not file.exists() or file.name == PROGRESS:
         return file.exists()
     try:
-        json.loads(file.read_text())
+        json.loads(regular.text(file))
     except json.JSONDecodeError:
         return False
     return True
@@ -246,7 +247,7 @@ def update_seconds(job: Job) -> list[float]:
 def evaluation_seconds(job: Job) -> float | None:
     """Time of a job's evaluation; None if it has none, or before it is done."""
     file = job.folder / EVALUATION
-    return json.loads(file.read_text()).get("seconds") if _complete(file) else None
+    return json.loads(regular.text(file)).get("seconds") if _complete(file) else None
 
 
 def _estimate(planned: Sequence[Job], measured: Callable[[Job], float | None]) -> Callable[[Job], float] | None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from endless_gym_agents import metrics, results
+from endless_gym_agents import metrics, regular, results
 from endless_gym_agents.curves import AXES, FAMILIES, Curve, aggregate, evaluated, published
 from endless_gym_agents.experiments import planning
 from endless_gym_agents.experiments.definitions import Run
@@ -219,7 +219,7 @@ def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]
 def _speed(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
     rows = []
     for run, (job, *_) in _by_run(jobs):
-        measured = json.loads((job.folder / planning.SPEED).read_text())
+        measured = json.loads(regular.text(job.folder / planning.SPEED))
         rows.append(_beside(run, {"mean": measured["mean"], "std": measured["std"]}))
     return rows, []
 
@@ -230,7 +230,7 @@ def _search(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
         if not (job.folder / "best.json").exists():
             rows.append({"environment": run.env, "run": run.name, "best choices": "no trial complete"})
             continue
-        best: dict[str, Any] = json.loads((job.folder / "best.json").read_text())
+        best: dict[str, Any] = json.loads(regular.text(job.folder / "best.json"))
         states = [trial["state"] for trial in best["trials"]]
         (chosen,) = [trial["choices"] for trial in best["trials"] if trial["trial"] == best["trial"]]
         rows.append(

@@ -8,6 +8,7 @@ use std::fs::{self, File};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use endless_gym_core::files;
 use endless_gym_kernels::adamw::AdamW;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -16,7 +17,7 @@ use crate::error::{Error, file};
 use crate::metrics::Episode;
 use crate::rollout::State;
 use crate::settings::{Agent, Settings};
-use endless_gym_kernels::network::{Network, Tensor};
+use endless_gym_kernels::network::{Network, Tensor, has_short_header};
 
 /// Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed.
 const VERSION: u32 = 1;
@@ -140,7 +141,7 @@ impl Checkpoint {
         if !path.exists() {
             return Err(Error::Checkpoint { path, what: "does not exist".to_owned() });
         }
-        let content = fs::read(&path).map_err(file(&path))?;
+        let content = files::read(&path).map_err(file(&path))?;
         Ok(Checkpoint { path, content })
     }
 
@@ -150,6 +151,9 @@ impl Checkpoint {
 
     /// The tensors and the text of the header. Files of weights from other programs have neither header nor checksum.
     fn tensors(&self) -> Result<(SafeTensors<'_>, Option<String>), Error> {
+        if !has_short_header(&self.content) {
+            return Err(self.wrong("is not a file of safetensors, or has far more tensors than a network"));
+        }
         let damaged = |error| self.wrong(format!("is damaged: {error}"));
         let tensors = SafeTensors::deserialize(&self.content).map_err(damaged)?;
         let metadata = SafeTensors::read_metadata(&self.content).map_err(damaged)?.1;

@@ -6,6 +6,7 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use endless_gym_core::{files, printable};
 use serde_json::{Map, Value as Json};
 
 use crate::error::{Error, file};
@@ -31,7 +32,8 @@ impl Logger {
     /// [`Error::File`].
     pub fn open(run: &Path, updates: u64, update: u64) -> Result<Self, Error> {
         let path = run.join(PROGRESS);
-        let text = if path.exists() { fs::read_to_string(&path).map_err(file(&path))? } else { String::new() };
+        let text = if path.exists() { files::read(&path).map_err(file(&path))? } else { Vec::new() };
+        let text = String::from_utf8_lossy(&text);
         let is_kept = |line: &&str| {
             let row: Option<Json> = serde_json::from_str(line).ok();
             row.is_some_and(|row| row["update"].as_u64().is_some_and(|number| number <= update))
@@ -102,7 +104,7 @@ impl Logger {
 /// Prints a line. A terminal or a pipe that is gone does not end the run.
 pub fn print(line: impl std::fmt::Display) {
     let mut stdout = io::stdout().lock();
-    let _ = writeln!(stdout, "{line}").and_then(|()| stdout.flush());
+    let _ = writeln!(stdout, "{}", printable(line)).and_then(|()| stdout.flush());
 }
 
 /// A duration for a line of text, such as `2.5 hours`.

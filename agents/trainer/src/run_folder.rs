@@ -6,6 +6,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use endless_gym_core::printable;
+
 use crate::error::{Error, file};
 use crate::settings::{SETTINGS, Settings};
 
@@ -61,7 +63,12 @@ impl Drop for RunFolder {
 
 /// The current time in UTC, such as 2026-01-31 12:00:00.
 fn now() -> String {
-    humantime::format_rfc3339_seconds(SystemTime::now()).to_string().replace('T', " ").replace('Z', "")
+    text(SystemTime::now())
+}
+
+fn text(time: SystemTime) -> String {
+    // Years before 1970, of a clock that was never set, have no such text.
+    humantime::format_rfc3339_seconds(time.max(SystemTime::UNIX_EPOCH)).to_string().replace('T', " ").replace('Z', "")
 }
 
 /// Makes the folder of a run without a given one; runs that start in the same second get different folders.
@@ -95,7 +102,8 @@ fn lock(run: &Path) -> Result<File, Error> {
                 return Err(Error::RunInUse { run: run.to_owned(), holder });
             }
             Err(TryLockError::Error(error)) => {
-                eprintln!("{} cannot be locked ({error}); start only one run in it", run.display());
+                let text = format!("{} cannot be locked ({error}); start only one run in it", run.display());
+                eprintln!("{}", printable(text));
             }
         }
         if lock.metadata().map_err(file(&path))?.nlink() == 0 {
@@ -106,5 +114,18 @@ fn lock(run: &Path) -> Result<File, Error> {
         let text = format!("process {process} on {host} since {} UTC\n", now());
         lock.set_len(0).and_then(|()| lock.write_all(text.as_bytes())).map_err(file(&path))?;
         return Ok(lock);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn a_clock_before_1970_does_not_end_a_run() {
+        let [before, after] = [text(SystemTime::UNIX_EPOCH - Duration::from_secs(9)), text(SystemTime::UNIX_EPOCH)];
+        assert_eq!([before, after], ["1970-01-01 00:00:00"; 2]);
     }
 }

@@ -345,7 +345,7 @@ pub fn read(run: &Path) -> Result<Settings, Error> {
     if !path.exists() {
         return Err(Error::NoRun { run: run.to_owned() });
     }
-    let text = std::fs::read(&path).map_err(file(&path))?;
+    let text = endless_gym_core::files::read(&path).map_err(file(&path))?;
     serde_json::from_slice(&text).map_err(Error::json(path.display()))
 }
 

@@ -188,7 +188,7 @@ fn errors_say_what_is_allowed_and_leave_nothing() {
         (format!("{new} --environment.option x"), "must be NAME=VALUE with a JSON value"),
         (format!("{new} --environment.option colour=1"), "colour"),
         (format!("{new} --init-from {at}/nowhere"), "nowhere does not exist"),
-        (format!("{new} --init-from /dev/null"), "is damaged"),
+        (format!("{new} --init-from /dev/null"), "it is not a regular file"),
         (format!("Nothing-v0 --run {at}/new"), "no environment `Nothing-v0`"),
     ] {
         let error = try_run(&arguments).unwrap_err().to_string();

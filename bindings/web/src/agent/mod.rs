@@ -7,7 +7,7 @@ mod tests;
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::random::{Generator, SeedSequence};
 use endless_gym_kernels::categorical;
-use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass};
+use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass, has_short_header};
 use endless_gym_kernels::sequences::Sequences;
 use linear_attention::{Kind, Sizes, Stack, State};
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
@@ -26,6 +26,10 @@ const MAX_LAYERS: usize = 16;
 pub enum AgentFileError {
     #[error("the file must be an exported agent in the format safetensors: {0}")]
     Format(#[from] SafeTensorError),
+    #[error(
+        "the file of an agent must be in the format safetensors, and must not have far more tensors than a network"
+    )]
+    Size,
     #[error("the file of an agent must have the entry `{METADATA}` of its metadata; export the agent again")]
     Metadata,
     #[error("the header of an agent cannot be read: {0}")]
@@ -90,6 +94,9 @@ pub struct Memory {
 impl Agent {
     /// Reads the file of an agent.
     pub fn read(file: &[u8]) -> Result<Self, AgentFileError> {
+        if !has_short_header(file) {
+            return Err(AgentFileError::Size);
+        }
         let tensors = SafeTensors::deserialize(file)?;
         let metadata = SafeTensors::read_metadata(file)?.1;
         let text = metadata.metadata().as_ref().and_then(|entries| entries.get(METADATA));

@@ -1,6 +1,5 @@
 //! The format of recorded episodes.
 
-use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
@@ -12,11 +11,12 @@ use serde::{Deserialize, Serialize, Serializer};
 use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
+use crate::files;
 use crate::pool::PoolError;
 
 /// Maximum length of a trace's JSON in bytes, so that a small file that decompresses to any length does not exhaust memory. The
-/// longest trace of the reference implementation has 2.4 MB.
-const MAX_BYTES: u64 = 64 << 20;
+/// longest trace of the reference implementation has 2.4 MB, and lists in a trace take many times the memory of their text.
+const MAX_BYTES: u64 = 8 << 20;
 
 /// One recorded environment object.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -125,7 +125,7 @@ impl Trace {
     ///
     /// [`TraceError::Open`], [`TraceError::Format`], [`TraceError::TooLong`], [`TraceError::Empty`] or [`TraceError::Truncated`].
     pub fn open(path: &Path) -> Result<Self, TraceError> {
-        Self::read(File::open(path).map_err(TraceError::Open)?)
+        Self::read(files::open(path).map_err(TraceError::Open)?)
     }
 
     /// Like [`open`](Self::open), from any source of the file's bytes.

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use crate::error::ServiceError;
 use crate::namespace::directory::Namespace;
-use crate::namespace::memory;
 use crate::namespace::node::NamespaceNode;
+use crate::namespace::{descriptors, memory};
 use crate::protocol::discovery;
 use crate::protocol::specification::ServiceSpecification;
 
@@ -63,6 +63,8 @@ pub(crate) fn connect_to_engine<T>(
     connect: impl Fn(&Arc<NamespaceNode>, &ServiceSpecification) -> Result<T, ServiceError>,
 ) -> Result<(Arc<NamespaceNode>, T, ServiceSpecification), ServiceError> {
     let start = Instant::now();
+    // For one group: how many the engine has is known later.
+    descriptors::reserve(descriptors::of_trainer(1))?;
     let node = Arc::new(NamespaceNode::join(&config.namespace, config.timeout)?);
     // Joining may have taken longer than a transition.
     let joined = Instant::now();

@@ -11,6 +11,7 @@ use std::thread::JoinHandle;
 use std::time::Instant;
 
 use endless_gym_core::batch::Frames;
+use endless_gym_core::files;
 use endless_gym_core::pool::{SavedEnv, Seeding};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
@@ -115,7 +116,7 @@ pub(crate) fn write(path: &Path, head: &CheckpointHead, groups: Vec<SavedGroup>)
     bytes[4..8].copy_from_slice(&CHECKPOINT_VERSION.to_le_bytes());
     bytes[8..PREAMBLE].copy_from_slice(&checksum.to_le_bytes());
     let new = new_path(path);
-    let written = File::create(&new).and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()));
+    let written = create(&new).and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()));
     let replaced = written.and_then(|()| fs::rename(&new, path));
     replaced.and_then(|()| File::open(directory(path))?.sync_all()).map_err(|e| {
         let _ = fs::remove_file(&new);
@@ -126,7 +127,7 @@ pub(crate) fn write(path: &Path, head: &CheckpointHead, groups: Vec<SavedGroup>)
 /// Checks early that a checkpoint can be written.
 pub(crate) fn check_writable(path: &Path) -> Result<(), CheckpointError> {
     let new = new_path(path);
-    let created = if path.is_dir() { Err(ErrorKind::IsADirectory.into()) } else { File::create(&new).map(drop) };
+    let created = if path.is_dir() { Err(ErrorKind::IsADirectory.into()) } else { create(&new).map(drop) };
     created
         .and_then(|()| fs::remove_file(&new))
         .map_err(|e| CheckpointError::Write { path: path.to_owned(), reason: e.to_string() })
@@ -134,7 +135,7 @@ pub(crate) fn check_writable(path: &Path) -> Result<(), CheckpointError> {
 
 /// Reads the groups of a checkpoint saved with this head; `None` if there is no file.
 pub(crate) fn read(path: &Path, head: &CheckpointHead) -> Result<Option<Vec<SavedGroup>>, CheckpointError> {
-    let bytes = match fs::read(path) {
+    let bytes = match files::read(path) {
         Ok(bytes) => bytes,
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
         Err(e) => return Err(CheckpointError::Read { path: path.to_owned(), reason: e.to_string() }),
@@ -175,6 +176,14 @@ fn new_path(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".new");
     name.into()
+}
+
+/// Creates the file that becomes the checkpoint, instead of one that a killed engine left. A link there is replaced, not followed.
+fn create(new: &Path) -> std::io::Result<File> {
+    match fs::remove_file(new) {
+        Err(e) if e.kind() != ErrorKind::NotFound => Err(e),
+        _ => File::create_new(new),
+    }
 }
 
 fn directory(path: &Path) -> &Path {

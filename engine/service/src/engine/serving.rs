@@ -117,6 +117,7 @@ impl Engine {
     /// and [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn new(registry: &Registry, config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
+        descriptors::reserve(descriptors::of_engine(config.groups, config.observers) + pictures::MAX_VIEWERS)?;
         let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
         discovery::refuse_second_engine(&node, &config.service, &node.lock()?)?;
         let (pools, threads) = (config.pools()?, Threads::new(config.threads)?);
@@ -146,7 +147,6 @@ impl Engine {
         let limits = specification.lease_limits();
         let blocks = chunk_blocks(&specification.batch);
         PrefaultedChunks::check_available(blocks, limits.trainer_chunks() * config.groups)?;
-        descriptors::reserve(descriptors::of_engine(config.groups, config.observers) + pictures::MAX_VIEWERS)?;
         let names = ServiceNames::new(&config.service, specification.incarnation);
         let services = EngineServices { node: &node, names, mode: OpenMode::Create };
         let creating = node.creating()?;

@@ -14,6 +14,7 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
+use endless_gym_core::files;
 use rand::RngExt;
 use rand::distr::Alphanumeric;
 
@@ -102,7 +103,7 @@ impl Identity {
 
     fn open(&self) -> Result<File, ServiceError> {
         self.check()?;
-        File::open(self.root.join(FILE)).map_err(|e| self.unusable(&e))
+        files::open(&self.root.join(FILE)).map_err(|e| self.unusable(&e))
     }
 
     fn unusable(&self, error: &io::Error) -> ServiceError {
@@ -127,7 +128,7 @@ pub(crate) struct ExclusiveCreation(#[expect(dead_code, reason = "held until it 
 
 /// The identity in `root`; `None` if it is missing or incomplete.
 fn read(root: &Path) -> io::Result<Option<Identity>> {
-    let file = match File::open(root.join(FILE)) {
+    let file = match files::open(&root.join(FILE)) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
         file => file?,
     };

@@ -18,6 +18,7 @@ use std::sync::atomic::{AtomicU64, Ordering, fence};
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym_core::batch::LAYOUT_VERSION;
+use endless_gym_core::printable;
 use rustix::fs::{FallocateFlags, FlockOperation, fallocate, flock};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use rustix::time::{ClockId, clock_gettime};
@@ -253,8 +254,13 @@ impl StatusReader {
         };
         for _ in 0..READ_ATTEMPTS {
             let before = sequence()?;
+            // The kernel loads the words in this thread, so that a fence orders these loads as it would this thread's own. This one
+            // pairs with the writer's last store: a record read after an even number is at least as new as that number.
+            fence(Ordering::Acquire);
             let mut record = R::zeroed();
             self.file.read_exact_at(bytemuck::bytes_of_mut(&mut record), offset + WORD as u64).ok()?;
+            // This one pairs with the writer's fence: if any word is of a later record, so is the number that is read now.
+            fence(Ordering::Acquire);
             if before.is_multiple_of(2) && sequence()? == before {
                 return Some(record);
             }
@@ -380,7 +386,7 @@ pub(crate) fn padded<const N: usize>(text: &str) -> [u8; N] {
 
 /// The text of a field that is padded with zeros.
 pub(crate) fn unpadded(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).trim_end_matches('\0').chars().filter(|c| !c.is_control()).collect()
+    printable(String::from_utf8_lossy(bytes).trim_end_matches('\0'))
 }
 
 #[cfg(test)]
