@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from endless_gym_agents import metrics, regular
+from endless_gym_agents import metrics
 from endless_gym_agents.checkpoint import read_settings
 from endless_gym_agents.logs import PROGRESS, read_progress
 from endless_gym_agents.results import Experiment, label
@@ -78,7 +78,7 @@ class Curve:
 @cache
 def _published() -> dict[str, Any]:
     file = resources.files("endless_gym_agents") / "published.json"
-    read: dict[str, Any] = json.loads(regular.text(file))
+    read: dict[str, Any] = json.loads(file.read_text())
     return read
 
 

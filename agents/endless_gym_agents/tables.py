@@ -53,4 +53,6 @@ def _lines(made: Table) -> RenderableType:
         for column, cell in zip(made.columns, row, strict=True):
             block.add_row(column.header, cell)
         parts += [Text(), block]
-    return Group(*parts, *([Text(), made.caption] if isinstance(made.caption, str) else []))
+    if isinstance(made.caption, str):
+        parts += [Text(), made.caption]
+    return Group(*parts)

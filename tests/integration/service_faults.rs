@@ -275,6 +275,39 @@ fn inside_small_shared_memory_observers_get_what_is_left() {
     engine.kill();
 }
 
+/// What SIGBUS leaves: segments that are shorter than their content, at which iceoryx2 panics.
+#[test]
+fn damaged_segments_of_a_dead_engine_end_neither_a_running_nor_a_new_one() {
+    let place = Place::new();
+    let mut running = place.engine("running", 1, 1);
+    drop(place.trainer("running").unwrap());
+    let of_running = place.segments();
+    let mut damaged = place.engine("damaged", 1, 1);
+    drop(place.trainer("damaged").unwrap());
+    running.stop();
+    damaged.kill();
+    let segments = place.segments().into_iter().filter(|path| !of_running.contains(path));
+    for segment in
+        segments.filter(|path| fs::metadata(path).unwrap().len() > 100 && path.extension().unwrap() != "status")
+    {
+        File::options().write(true).open(segment).unwrap().set_len(100).unwrap();
+    }
+    running.resume();
+    // Longer than until an idle engine looks for dead processes.
+    std::thread::sleep(Duration::from_secs(1));
+    assert_eq!(running.0.try_wait().unwrap(), None);
+    let next = place.engine("next", 1, 1);
+    for engine in ["running", "next"] {
+        play(&mut place.trainer(engine).unwrap(), 0, 2);
+    }
+    next.end();
+    running.end();
+    let alone = place.engine("alone", 1, 1);
+    play(&mut place.trainer("alone").unwrap(), 0, 2);
+    alone.end();
+    place.assert_nothing_left();
+}
+
 #[test]
 fn few_descriptors_are_an_error_or_enough() {
     let place = Place::new();
@@ -286,16 +319,16 @@ fn few_descriptors_are_an_error_or_enough() {
         command.arg(env!("CARGO_BIN_EXE_endless")).args(["serve", "--env", ID, "--num-envs=2", "--groups=2"]);
         Process::spawn(command.arg("--service=gym").stdout(Stdio::null()).stderr(Stdio::piped()))
     };
-    let mut needed = 0;
-    for limit in [20, 40, 60] {
+    let needed = [20, 40, 60].map(|limit| {
         let mut engine = limited(limit);
         let text = engine.errors();
         assert_eq!(engine.wait().code(), Some(1), "{text}");
         assert!(text.contains(&format!("the limit of this process is {limit}")), "{text}");
-        needed = text.split_whitespace().nth(1).unwrap().parse().unwrap();
-    }
+        text.split_whitespace().nth(1).unwrap().parse().unwrap()
+    });
+    assert_eq!(needed, [needed[0]; 3], "the whole need is said at once");
     // The number in the message suffices for a trainer and all observers.
-    let _engine = limited(needed);
+    let _engine = limited(needed[0]);
     let mut trainer = place.trainer("gym").unwrap();
     let config = place.connect_config("gym");
     let mut observers: Vec<_> = (0..6).map(|number| Observer::connect(&config, number % 2).unwrap()).collect();

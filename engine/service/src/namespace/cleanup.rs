@@ -114,8 +114,17 @@ pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock, _all: &Excl
     true
 }
 
-/// Removes everything. The caller knows that no process uses the namespace.
-pub(crate) fn remove_all(config: &Config, _lock: &NamespaceLock) {
+/// Removes everything, unless a process uses the namespace whose shared memory is not this one's, as in another container. The caller
+/// knows that no other process does.
+pub(crate) fn remove_all_unless_used(config: &Config, _lock: &NamespaceLock) {
+    let mut is_used = false;
+    let listed = Node::<Ipc>::list(config, |state| {
+        is_used |= matches!(state, NodeState::Alive(_) | NodeState::Inaccessible(_));
+        CallbackProgression::Continue
+    });
+    if listed.is_err() || is_used {
+        return;
+    }
     remove_files(config);
     for directory in [files::service_directory(config), files::node_directory(config)] {
         if directory.exists() {

@@ -1,8 +1,11 @@
 //! The iceoryx2 node of this process in a namespace, and the state of other processes' nodes.
 
+use std::collections::HashSet;
 use std::fs;
 use std::ops::Deref;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use iceoryx2::identifiers::UniqueNodeId;
@@ -33,6 +36,8 @@ pub(crate) struct NamespaceNode {
     root: PathBuf,
     /// How long this process waits for the namespace's lock.
     patience: Duration,
+    /// The dead nodes whose segments are damaged so that iceoryx2 panics: the first process that is alone in the namespace removes them.
+    damaged: Mutex<HashSet<u128>>,
 }
 
 impl NamespaceNode {
@@ -57,13 +62,12 @@ impl NamespaceNode {
         if memory::check_free(memory::NODE_BYTES).is_err() {
             // Dead processes may occupy the memory, and iceoryx2 needs some to remove them.
             members::remove_abandoned(namespace, None);
-            if let Some(identity) =
-                Identity::existing(namespace).filter(|identity| !members::is_used(identity.prefix()))
-            {
-                cleanup::remove_all(&namespace.config(identity.prefix())?, lock);
-            }
-            memory::check_free(memory::NODE_BYTES)?;
         }
+        if let Some(identity) = Identity::existing(namespace).filter(|identity| !members::is_used(identity.prefix())) {
+            // iceoryx2 cannot remove dead processes whose segments are damaged, as of one that was ended by SIGBUS.
+            cleanup::remove_all_unless_used(&namespace.config(identity.prefix())?, lock);
+        }
+        memory::check_free(memory::NODE_BYTES)?;
         descriptors::reserve(descriptors::NODE)?;
         let (identity, config) = own_identity(namespace, lock)?;
         let membership = Membership::join(identity.prefix(), lock)?;
@@ -74,7 +78,8 @@ impl NamespaceNode {
         cleanup::remove_counter(&config, lock)?;
         let node = node.map_err(ServiceError::middleware("cannot register this process"))?;
         let root = namespace.root().to_owned();
-        let node = NamespaceNode { node: ForkGuard::new(node), identity, membership: Some(membership), root, patience };
+        let (node, membership, damaged) = (ForkGuard::new(node), Some(membership), Mutex::default());
+        let node = NamespaceNode { node, identity, membership, root, patience, damaged };
         node.clean(lock);
         Ok(node)
     }
@@ -150,12 +155,17 @@ impl NamespaceNode {
                 tracing::debug!(process, error = %e, "cannot remove the resources of a process that has died yet");
                 break;
             }
-            match node.try_remove_stale_resources() {
-                Ok(_) => {
+            let number = node.id().value();
+            if self.damaged().contains(&number) {
+                continue;
+            }
+            match catch_unwind(AssertUnwindSafe(|| node.try_remove_stale_resources())) {
+                Ok(Ok(_)) => {
                     tracing::info!(process, "removed the resources of a process that has died");
                     removed += 1;
                 }
-                Err(e) => tracing::debug!(error = %e, "cannot remove a dead node"),
+                Ok(Err(e)) => tracing::debug!(error = %e, "cannot remove a dead node"),
+                Err(_) => drop(self.damaged().insert(number)),
             }
         }
         cleanup::remove_incomplete_nodes(self.config(), lock);
@@ -163,6 +173,10 @@ impl NamespaceNode {
             cleanup::remove_incomplete_services(self.config(), lock, all);
         }
         removed
+    }
+
+    fn damaged(&self) -> MutexGuard<'_, HashSet<u128>> {
+        self.damaged.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn dead_nodes(&self) -> Vec<DeadNodeView<Ipc>> {
