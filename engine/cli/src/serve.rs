@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use endless_gym_core::files;
 use endless_gym_core::pool::{Autoreset, PoolConfig, Registry};
-use endless_gym_service::{CheckpointConfig, Engine, EngineActivity, EngineConfig, ServiceError};
+use endless_gym_service::{CheckpointConfig, Engine, EngineActivity, EngineConfig, EngineMonitor, ServiceError};
 use endless_gym_view::MetricsServer;
 use serde::Deserialize;
 
@@ -129,7 +129,7 @@ fn read(path: &Path) -> Result<EngineConfig, Failure> {
 /// Ends this process if the engine was asked to stop while a step, or another call of an environment, does not end. Saving a
 /// checkpoint takes as long as it takes.
 fn watch(engine: &Engine, config: &EngineConfig, stop: &'static AtomicBool) -> Result<Option<Watchdog>, Failure> {
-    let Some(monitor) = engine.monitor() else { return Ok(None) };
+    let Some(monitor) = EngineMonitor::open(&config.namespace, engine.specification()) else { return Ok(None) };
     let (service, id, namespace) = (config.service.clone(), config.pool.id.clone(), config.namespace.clone());
     let stuck = move |grace| match monitor.activity() {
         activity @ EngineActivity::Busy { kind, since, .. } if since >= grace && kind != "checkpoint" => {

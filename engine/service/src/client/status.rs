@@ -13,6 +13,7 @@ use crate::error::EngineActivity;
 use crate::namespace::directory::{Ipc, Namespace};
 use crate::namespace::identity::Identity;
 use crate::protocol::ports::SERVICE_PREFIX;
+use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, EngineRecord, GroupRecord, ObserverRecord, StatusReader, now, unpadded};
 
 /// The status of an engine, read from shared memory. Reading it affects neither the engine nor its trainer.
@@ -226,11 +227,18 @@ pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize
     EngineActivity::NotTaken { process: engine.head.process }
 }
 
-/// Shows what an engine of this process is doing, while another thread runs it.
+/// Shows what one run of an engine is doing, also after its files were removed.
 #[derive(Debug)]
-pub struct EngineMonitor(pub(crate) StatusReader);
+pub struct EngineMonitor(StatusReader);
 
 impl EngineMonitor {
+    /// Opens the status of an engine; `None` if that is not possible.
+    pub fn open(namespace: &Namespace, engine: &ServiceSpecification) -> Option<Self> {
+        let identity = Identity::existing(namespace)?;
+        let path = status_file::path(identity.prefix(), &engine.service, engine.incarnation);
+        StatusReader::open(&path).map(EngineMonitor)
+    }
+
     /// The request that the engine is executing; [`EngineActivity::NotTaken`] if there is none.
     pub fn activity(&self) -> EngineActivity {
         activity(Some(&self.0), 0, 0, u64::MAX)

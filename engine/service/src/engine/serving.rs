@@ -9,7 +9,6 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use serde_json::json;
 
-use crate::client::status::EngineMonitor;
 use crate::engine::checkpoint::{CheckpointHead, Checkpointer};
 use crate::engine::config::EngineConfig;
 use crate::engine::group::{Group, Outcome, Rejected, RequestSample};
@@ -199,11 +198,6 @@ impl Engine {
         &self.specification
     }
 
-    /// Looks at what the engine is doing from another thread; `None` if its status cannot be opened.
-    pub fn monitor(&self) -> Option<EngineMonitor> {
-        self.status.reader().map(EngineMonitor)
-    }
-
     /// Batches that each group has returned, including those before the checkpoint that the engine resumed from.
     pub fn steps(&self) -> Vec<u64> {
         (0..self.groups.len()).map(|group| self.status.step(group)).collect()
@@ -215,7 +209,8 @@ impl Engine {
     ///
     /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, since no trainer can
     /// find the engine any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine
-    /// cannot continue. [`ServiceError::Panic`] if an environment panics; the trainer is told as well. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; earlier failures are
+    /// cannot continue. [`ServiceError::Panic`] if an environment panics; the trainer is told as well.
+    /// [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; earlier failures are
     /// logged and tried again later. A trainer's faults are not errors: its requests are rejected.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());

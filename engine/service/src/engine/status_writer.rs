@@ -8,9 +8,7 @@ use crate::engine::group::Outcome;
 use crate::error::{PACKAGE_VERSION, ServiceError};
 use crate::protocol::message::RequestHeader;
 use crate::protocol::specification::ServiceSpecification;
-use crate::protocol::status_file::{
-    self, EngineHead, EngineRecord, GroupRecord, MAGIC, StatusFile, StatusReader, now, padded,
-};
+use crate::protocol::status_file::{self, EngineHead, EngineRecord, GroupRecord, MAGIC, StatusFile, now, padded};
 
 /// Keeps the records of an engine and publishes every change, which takes tens of nanoseconds.
 #[derive(Debug)]
@@ -53,11 +51,6 @@ impl StatusWriter {
     /// Lets other processes find the engine, under its name.
     pub(crate) fn publish(&mut self) -> Result<(), ServiceError> {
         self.file.publish(&self.path)
-    }
-
-    /// Reads the status, also after the file was removed.
-    pub(crate) fn reader(&self) -> Option<StatusReader> {
-        StatusReader::open(&self.path)
     }
 
     /// Changes the engine's record.
