@@ -4,8 +4,7 @@
 //! begin with `state/`, and the rest is JSON text in the entry `endless` of the metadata. The random numbers need no state: each update
 //! has a generator of its own. A checksum of all of it, in the entry `crc32`, detects damage, which the format does not.
 
-use std::fs::{self, File};
-use std::io::Write;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use endless_gym_core::files;
@@ -94,7 +93,7 @@ pub fn save(
         ("state/lengths".to_owned(), Dtype::U64, vec![lengths.len()], bytemuck::cast_slice(&lengths).to_vec()),
     ];
     let folder = run.join(FOLDER);
-    let (last, temporary) = (folder.join(LAST), folder.join(format!("{LAST}.new")));
+    let last = folder.join(LAST);
     let tensors: Vec<_> = weights.chain(hidden).chain(others).collect();
     let views = tensors
         .iter()
@@ -107,21 +106,18 @@ pub fn save(
 
     let write = || {
         fs::create_dir_all(&folder)?;
-        let mut file = File::create(&temporary)?;
-        file.write_all(&content)?;
-        file.sync_all()?;
         if keep {
-            // A hard link: the same file under a second name.
-            let numbered = folder.join(format!("update-{update:06}.safetensors"));
-            let _ = fs::remove_file(&numbered);
-            fs::hard_link(&temporary, numbered)?;
+            // First, since a run that resumes from the last one does not write its number again.
+            files::replace(&folder.join(format!("update-{update:06}.safetensors")), &content)?;
         }
-        fs::rename(&temporary, &last)
+        files::replace(&last, &content)
     };
-    write().map_err(|source| {
-        let _ = fs::remove_file(&temporary);
-        Error::File { path: last.clone(), source }
-    })
+    write().map_err(file(&last))
+}
+
+/// Whether a run has a last checkpoint, of this program or of the Python agents.
+pub(crate) fn exists(run: &Path) -> bool {
+    [LAST, "last.pt"].iter().any(|name| run.join(FOLDER).join(name).exists())
 }
 
 /// The content of a checkpoint file.

@@ -23,7 +23,7 @@ pub enum Error {
         what: &'static str,
     },
     /// The folder has no run.
-    #[error("no run in {}; expected a folder with settings.json, as `endless learn` writes it", run.display())]
+    #[error("no run in {0}; expected a folder with settings.json, as `endless learn` writes it; start a run there with --run {0}", run.display())]
     NoRun {
         /// The folder.
         run: PathBuf,
@@ -49,6 +49,20 @@ pub enum Error {
         path: PathBuf,
         /// What is wrong with it.
         what: String,
+    },
+    /// The log of a run has no row of an update that its checkpoint contains.
+    #[error(
+        "{0}/progress.jsonl has no row of update {missing}, and the checkpoint is of update {update}; restore the file, or start a new \
+         run with --init-from {0}",
+        run.display()
+    )]
+    Progress {
+        /// The folder of the run.
+        run: PathBuf,
+        /// The update of the checkpoint.
+        update: u64,
+        /// The first update without a row.
+        missing: u64,
     },
     /// The loss, the gradient or the weights are no longer finite.
     #[error(

@@ -30,22 +30,25 @@ pub mod settings;
 pub mod threads;
 pub mod update;
 
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use checkpoint::Checkpoint;
+use endless_gym_core::files;
 use endless_gym_kernels::network::Network;
 use environments::Environments;
 use error::{Error, file};
-use logs::{Logger, print};
+use logs::{Logger, PROGRESS, print};
 use rollout::{Clock, Player, Purpose, RECENT, State, generator};
 use run_folder::RunFolder;
 use settings::{SETTINGS, Settings};
 use threads::Threads;
 use update::Learner;
 
-/// Trains an agent in a new run, or resumes one from its last checkpoint. Returns the folder of the run.
+/// Trains an agent in a new run, or resumes one from its last checkpoint. A run that ended before its first one starts again. Returns the
+/// folder of the run.
 ///
 /// # Arguments
 ///
@@ -66,11 +69,16 @@ pub fn learn(
     let folder = RunFolder::open(&settings)?;
     let run = &*folder.path;
     let is_resumed = !settings.resume.is_empty();
-    let resumed = is_resumed.then(|| Checkpoint::read(run)).transpose()?;
-    if let Some(checkpoint) = &resumed {
+    if is_resumed {
         settings.check_resumable(&settings::read(run)?)?;
+    }
+    // The first checkpoint is older than the first row.
+    let has_begun = checkpoint::exists(run) || fs::metadata(run.join(PROGRESS)).is_ok_and(|rows| rows.len() > 0);
+    let resumed = (is_resumed && has_begun).then(|| Checkpoint::read(run)).transpose()?;
+    if let Some(checkpoint) = &resumed {
         checkpoint.check(&settings)?;
     }
+    let is_new = resumed.is_none();
     let kept = Settings { resume: String::new(), run: run.to_string_lossy().into_owned(), ..settings.clone() };
     let num_envs = settings.environment.num_envs;
     let (threads, started) = (Threads::new(settings.threads)?, Instant::now());
@@ -90,12 +98,12 @@ pub fn learn(
     // Written only after everything above has succeeded. A resumed run keeps its changed settings.
     let mut logger = Logger::open(run, settings.ppo.updates, update)?;
     let text = serde_json::to_string_pretty(&kept).map_err(Error::json(SETTINGS))?;
-    std::fs::write(run.join(SETTINGS), text + "\n").map_err(file(&run.join(SETTINGS)))?;
+    files::replace(&run.join(SETTINGS), (text + "\n").as_bytes()).map_err(file(&run.join(SETTINGS)))?;
     let save = |counts, network: &Network, learner: &Learner, state: &State, keep: bool| {
         checkpoint::save(run, &kept, counts, network, &learner.optimizer, state, keep)
     };
     let mut state = player.state()?;
-    if !is_resumed {
+    if is_new {
         save((update, steps), &network, &learner, &state, settings.keep_checkpoints)?;
     }
     let (mut saved, mut saved_at) = (update, Instant::now());
@@ -111,6 +119,7 @@ pub fn learn(
         state = match player.collect(&network, &threads, update, &mut clock).and_then(|()| player.state()) {
             Ok(state) => state,
             Err(error) => {
+                logger.sync()?;
                 save((update, steps), &network, &learner, &state, false)?;
                 return Err(Error::Saved { error: Box::new(error), update, run: run.to_owned() });
             }
@@ -152,6 +161,7 @@ pub fn learn(
         is_done = is_stopped || update >= settings.ppo.updates;
         let is_planned = is_done || update % settings.checkpoint_interval == 0;
         if is_planned || is_late(settings.checkpoint_minutes, saved_at) {
+            logger.sync()?;
             save((update, steps), &network, &learner, &state, settings.keep_checkpoints && is_planned)?;
             (saved, saved_at) = (update, Instant::now());
         }

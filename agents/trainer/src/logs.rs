@@ -1,7 +1,7 @@
 //! Logs of a run: one line per update on standard output, `progress.jsonl`, and TensorBoard's events.
 
 use std::collections::VecDeque;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -13,7 +13,7 @@ use crate::error::{Error, file};
 use crate::rollout::Clock;
 
 /// Log file in the folder of a run, with one JSON object per update.
-const PROGRESS: &str = "progress.jsonl";
+pub(crate) const PROGRESS: &str = "progress.jsonl";
 
 /// Writes the metrics of each update.
 pub struct Logger {
@@ -25,22 +25,27 @@ pub struct Logger {
 }
 
 impl Logger {
-    /// Opens the logs of a run of so many updates, of which `update` are done. Rows of later updates are removed.
+    /// Opens the logs of a run of so many updates, of which `update` are done. What follows their rows is cut off: rows of later updates,
+    /// and the part of a row that a killed process wrote.
     ///
     /// # Errors
     ///
-    /// [`Error::File`].
+    /// [`Error::File`], and [`Error::Progress`] if a row of these updates is missing.
     pub fn open(run: &Path, updates: u64, update: u64) -> Result<Self, Error> {
         let path = run.join(PROGRESS);
         let text = if path.exists() { files::read(&path).map_err(file(&path))? } else { Vec::new() };
-        let text = String::from_utf8_lossy(&text);
-        let is_kept = |line: &&str| {
-            let row: Option<Json> = serde_json::from_str(line).ok();
-            row.is_some_and(|row| row["update"].as_u64().is_some_and(|number| number <= update))
-        };
-        let kept: String = text.lines().filter(is_kept).map(|line| format!("{line}\n")).collect();
-        fs::write(&path, kept).map_err(file(&path))?;
-        let progress = OpenOptions::new().append(true).open(&path).map_err(file(&path))?;
+        let mut lines = text.split_inclusive(|byte| *byte == b'\n');
+        let mut length = 0;
+        for number in 1..=update {
+            let line = lines.next().filter(|line| line.ends_with(b"\n")).unwrap_or_default();
+            let row: Option<Json> = serde_json::from_slice(line).ok();
+            if row.is_none_or(|row| row["update"] != number) {
+                return Err(Error::Progress { run: run.to_owned(), update, missing: number });
+            }
+            length += line.len() as u64;
+        }
+        let progress = OpenOptions::new().append(true).create(true).open(&path).map_err(file(&path))?;
+        progress.set_len(length).map_err(file(&path))?;
         Ok(Logger { progress, events: Events::create(run)?, updates, recent: VecDeque::new() })
     }
 
@@ -76,6 +81,15 @@ impl Logger {
         self.events.scalar("update", update as f32, steps)?;
         self.line(update, steps, rate, metrics, &seconds);
         Ok(())
+    }
+
+    /// Waits until the rows are on disk. A checkpoint must not outlive the rows of its updates when the machine fails.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::File`].
+    pub fn sync(&self) -> Result<(), Error> {
+        self.progress.sync_data().map_err(file(Path::new(PROGRESS)))
     }
 
     /// Prints one update.

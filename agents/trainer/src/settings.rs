@@ -291,7 +291,7 @@ pub fn with_defaults(mut command: Command, arguments: &[OsString]) -> Result<Com
         let mut values = serde_json::to_value(read(Path::new(&run))?).map_err(Error::json(SETTINGS))?;
         if let Json::Object(top) = &mut values {
             // Those of one call only.
-            ["run", "resume", "init_from", "time_limit"].iter().for_each(|name| drop(top.remove(*name)));
+            ["run", "resume", "time_limit"].iter().for_each(|name| drop(top.remove(*name)));
         }
         command = flat(&values).into_iter().fold(command, |command, (_, id, values)| set(command, id, values));
     } else if value_of(arguments, "--preset").is_some_and(|name| name == "paper") {

@@ -1,7 +1,10 @@
 //! Whole runs, in this process and with an engine.
 
+use std::collections::HashSet;
 use std::fs;
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
+use std::process::Command as Process;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -105,6 +108,100 @@ fn a_resumed_run_continues_with_the_same_bits() {
         let resumed = try_run(&format!("--resume {} --ppo.updates 4", run.display())).unwrap();
         assert_same(&whole, &resumed);
         assert_eq!(progress(&resumed).len(), 4);
+    }
+}
+
+#[test]
+fn a_missing_row_is_an_error() {
+    let folder = Folder::new("rows");
+    let run = folder.run("run", "--ppo.updates 3");
+    let file = run.join("progress.jsonl");
+    let rows = fs::read_to_string(&file).unwrap();
+    let rows: Vec<_> = rows.split_inclusive('\n').collect();
+    for (text, update) in [
+        (String::new(), 1),
+        (rows[1..].concat(), 1),
+        ([rows[0], rows[2]].concat(), 2),
+        ([rows[0], &rows[1][1..], rows[2]].concat(), 2),
+        (rows.concat().trim_end().to_owned(), 3),
+    ] {
+        fs::write(&file, &text).unwrap();
+        let error = try_run(&format!("--resume {} --ppo.updates 4", run.display())).unwrap_err();
+        assert!(matches!(error, Error::Progress { missing, .. } if missing == update), "{error}");
+        assert_eq!(fs::read_to_string(&file).unwrap(), text);
+    }
+    // Without its checkpoint, a run that has begun does not start again.
+    fs::remove_file(run.join("checkpoints/last.safetensors")).unwrap();
+    let error = try_run(&format!("--resume {} --ppo.updates 4", run.display())).unwrap_err();
+    assert!(matches!(error, Error::Checkpoint { .. }), "{error}");
+}
+
+#[test]
+fn a_run_without_a_checkpoint_starts_again_from_its_settings() {
+    let folder = Folder::new("begun");
+    let weights = folder.run("weights", "--ppo.updates 1");
+    let from = format!("--init-from {}", weights.display());
+    let (expected, run) = (folder.run("expected", &from), folder.run("run", &from));
+    fs::remove_dir_all(run.join("checkpoints")).unwrap();
+    fs::write(run.join("progress.jsonl"), "").unwrap();
+    let error = try_run(&format!("{SMALL} --run {}", run.display())).unwrap_err().to_string();
+    assert!(error.contains(&format!("continue it with --resume {}", run.display())), "{error}");
+    assert_same(&expected, &try_run(&format!("--resume {}", run.display())).unwrap());
+}
+
+/// A library to preload, which kills a process at one of its calls that change files.
+fn kill_at(folder: &Folder) -> PathBuf {
+    let library = folder.0.join("kill_at.so");
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/kill_at.c");
+    let status = Process::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).args([source, "-ldl"]).status();
+    assert!(status.unwrap().success());
+    library
+}
+
+#[test]
+fn a_run_killed_at_any_call_that_changes_its_files_continues_with_one_command() {
+    if let Ok(arguments) = std::env::var("LEARN") {
+        try_run(&arguments).unwrap();
+        return;
+    }
+    let folder = Folder::new("killed");
+    let (library, run) = (kill_at(&folder), folder.0.join("run"));
+    let start = format!("{SMALL} --keep-checkpoints --checkpoint-interval 2 --run {}", run.display());
+    let resume = format!("--resume {} --ppo.updates 4", run.display());
+    let whole = folder.run("whole", "--keep-checkpoints --checkpoint-interval 2");
+    let half = folder.run("half", "--keep-checkpoints --checkpoint-interval 2 --ppo.updates 2");
+    // As if the process had been killed after the next update.
+    let rows = fs::read_to_string(half.join("progress.jsonl")).unwrap();
+    fs::write(half.join("progress.jsonl"), format!("{rows}{{\"update\": 3}}\n{{\"upda")).unwrap();
+    let checkpoints = |run: &Path| {
+        let files = fs::read_dir(run.join("checkpoints")).unwrap();
+        files.map(|file| file.unwrap().file_name()).collect::<HashSet<_>>()
+    };
+    let train = |arguments: &str, kill: usize| {
+        let mut process = Process::new(std::env::current_exe().unwrap());
+        process.args(["--exact", "a_run_killed_at_any_call_that_changes_its_files_continues_with_one_command"]);
+        process.env("LEARN", arguments).env("LD_PRELOAD", &library).env("KILL_FOLDER", &run);
+        process.env("KILL_AT", kill.to_string()).output().unwrap()
+    };
+    for is_resumed in [false, true] {
+        for kill in 1.. {
+            let _ = fs::remove_dir_all(&run);
+            if is_resumed {
+                assert!(Process::new("cp").arg("-r").args([&half, &run]).status().unwrap().success());
+            }
+            let killed = train(if is_resumed { &resume } else { &start }, kill);
+            let is_done = killed.status.success();
+            assert!(is_done || killed.status.signal() == Some(9), "{killed:?}");
+            let again = if run.join("settings.json").exists() { &resume } else { &start };
+            let ended = train(again, 0);
+            assert!(ended.status.success(), "after call {kill}: {ended:?}");
+            assert_same(&whole, &run);
+            assert_eq!(checkpoints(&whole), checkpoints(&run), "after call {kill}");
+            if is_done {
+                assert!(kill > 20, "only {kill} calls");
+                break;
+            }
+        }
     }
 }
 

@@ -1,7 +1,7 @@
-//! Reads files whose paths come from users.
+//! Reads files whose paths come from users, and replaces files as a whole.
 
-use std::fs::File;
-use std::io::{self, ErrorKind, Read};
+use std::fs::{self, File};
+use std::io::{self, ErrorKind, Read, Write};
 use std::path::Path;
 
 /// Opens a regular file for reading. Anything else is an error: opening a FIFO would wait for a writer, and a device may never end.
@@ -33,6 +33,26 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     content.try_reserve_exact(usize::try_from(length).unwrap_or(usize::MAX))?;
     file.take(length).read_to_end(&mut content)?;
     Ok(content)
+}
+
+/// Writes a file under another name in the same folder, and renames it once it is on disk, so that a killed process or a full disk
+/// leaves the former content.
+///
+/// # Errors
+///
+/// That of the first operation that failed; the file then has its former content.
+pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
+    let mut new = path.as_os_str().to_owned();
+    new.push(".new");
+    // What a killed process left. It may also be a link, whose target must not be written.
+    let _ = fs::remove_file(&new);
+    let write = || {
+        let mut file = File::create_new(&new)?;
+        file.write_all(content)?;
+        file.sync_all()?;
+        fs::rename(&new, path)
+    };
+    write().inspect_err(|_| drop(fs::remove_file(&new)))
 }
 
 #[cfg(all(test, unix))]
