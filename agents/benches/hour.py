@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from endless_gym.program import program
-from endless_gym_agents import checkpoint
+from endless_gym_agents import atomic, checkpoint
 from endless_gym_agents.curves import published
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.logs import read_progress
@@ -121,7 +121,7 @@ def report() -> None:
         lines.append("| " + " | ".join([data["env"], data["metric"], *shown]) + " |")
     picture = '<source media="(prefers-color-scheme: dark)" srcset="hour-dark.svg">'
     picture = f'<picture>{picture}<img src="hour-light.svg" alt="the metric of each run over minutes"></picture>'
-    (FOLDER / "README.md").write_text("\n".join([*lines, "", picture]) + "\n")
+    atomic.write(FOLDER / "README.md", "\n".join([*lines, "", picture]) + "\n")
 
 
 def main() -> None:
@@ -140,7 +140,7 @@ def main() -> None:
     if args.task:
         args.out.mkdir(parents=True, exist_ok=True)
         found = run(args.task, args.agent, args.scale, args.out)
-        (FOLDER / f"{args.task}-{args.agent}.json").write_text(json.dumps(found) + "\n")
+        atomic.write(FOLDER / f"{args.task}-{args.agent}.json", json.dumps(found) + "\n")
     if args.report:
         report()
 

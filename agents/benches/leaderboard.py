@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from endless_gym_agents import checkpoint, export, reproduce
+from endless_gym_agents import atomic, checkpoint, export, reproduce
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.conformance import state_bytes
 from endless_gym_agents.evaluate import evaluate, mean
@@ -96,7 +96,7 @@ def row(job: Job, task: Task, agent: str, size: str) -> dict[str, Any]:
         "steps": loaded.steps,
         "minutes": round(sum(planning.update_seconds(job)) / 60, 2),
     }
-    file.write_text(json.dumps(found) + "\n")
+    atomic.write(file, json.dumps(found) + "\n")
     return found
 
 
@@ -262,7 +262,7 @@ def main() -> None:
     written = experiment(track, tasks, agents, args.sizes)
     args.out.mkdir(parents=True, exist_ok=True)
     file = args.out / f"{args.track}.json"
-    file.write_text(json.dumps(written, indent=1) + "\n")
+    atomic.write(file, json.dumps(written, indent=1) + "\n")
     seeds, failure = tuple(args.seeds or track["seeds"]), None
     if not args.table:
         given = reproduce.ReproduceArguments(
@@ -300,11 +300,12 @@ def main() -> None:
     }
     lines = ",\n".join(json.dumps(rows[key]) for key in sorted(rows, key=str))
     summary = ",\n".join(map(json.dumps, summaries(track, list(rows.values()))))
-    results.write_text(
+    atomic.write(
+        results,
         f'{{"track": {json.dumps(args.track)}, "machine": {json.dumps(machine)}, "summary": [\n{summary}\n], "rows": [\n'
-        f"{lines}\n]}}\n"
+        f"{lines}\n]}}\n",
     )
-    results.with_name(f"{results.name.partition('.')[0]}.md").write_text(table(track, list(rows.values())))
+    atomic.write(results.with_name(f"{results.name.partition('.')[0]}.md"), table(track, list(rows.values())))
     print(f"{len(rows)} rows in {results}")
     if args.best is not None:
         export_best(done, args.best)

@@ -19,7 +19,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from endless_gym_agents import checkpoint
+from endless_gym_agents import atomic, checkpoint
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.train import parse, train
@@ -99,7 +99,7 @@ def report() -> None:
     text = "mean reward of the last 100 episodes during training, for each task and agent"
     picture = f'<picture>{picture}<img src="curves-light.svg" alt="{text}"></picture>'
     lines += ["", picture, "", "The first run of each task:", "", *commands]
-    (FOLDER / "README.md").write_text("\n".join(lines) + "\n")
+    atomic.write(FOLDER / "README.md", "\n".join(lines) + "\n")
 
 
 def main() -> None:
@@ -131,7 +131,7 @@ def main() -> None:
                     row = run(shlex.split(given), Path(folder) / "run")
                 kept = [old for old in data["runs"] if (old["agent"], old["seed"]) != (agent, seed)]
                 data["runs"] = [*kept, row]
-                file.write_text(as_json(data))
+                atomic.write(file, as_json(data))
                 print(
                     f"{args.task} {agent} {seed}: {row['evaluation_reward']:.4f} after {row['minutes']} minutes",
                     flush=True,

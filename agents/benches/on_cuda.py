@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 
-from endless_gym_agents import losses
+from endless_gym_agents import atomic, losses
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.logs import read_progress
@@ -226,9 +226,9 @@ def main() -> int:
     text = markdown(report)
     print(text)
     if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n")
+        atomic.write(args.json, json.dumps(report, indent=1) + "\n")
     if args.markdown:
-        args.markdown.write_text(text)
+        atomic.write(args.markdown, text)
     return 0 if all(row["equal"] for row in report["equality"]) else 1
 
 

@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 
 import endless_gym
+from endless_gym_agents import atomic
 
 HERE = Path(__file__).parent
 
@@ -141,7 +142,7 @@ def main() -> None:
         settings = {
             key: str(value) for key, value in vars(args).items() if key not in ("original", "cleanrl", "output")
         }
-        args.output.write_text(json.dumps({"settings": settings, "results": rows}, indent=1) + "\n")
+        atomic.write(args.output, json.dumps({"settings": settings, "results": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

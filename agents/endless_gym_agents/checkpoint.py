@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -25,8 +24,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from endless_gym.specs import spec
-from endless_gym_agents import ranges, regular
+from endless_gym_agents import atomic, ranges, regular
 from endless_gym_agents.agent import Agent, make_agent
+from endless_gym_agents.logs import PROGRESS
 from endless_gym_agents.settings import Settings, Transformer, from_dict
 
 #: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
@@ -102,26 +102,14 @@ def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
     """
     folder = run / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    last, temporary = folder / LAST, folder / f"{LAST}.new"
     # torch reports a file that cannot be written without the reason.
     content = io.BytesIO()
     torch.save({"version": CHECKPOINT_VERSION} | state, content)
-    try:
-        with temporary.open("wb") as file:
-            file.write(content.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        if keep:
-            # A hard link: the same file under a second name.
-            numbered = folder / f"update-{state['update']:06d}.pt"
-            numbered.unlink(missing_ok=True)
-            os.link(temporary, numbered)
-        os.replace(temporary, last)
-    except OSError:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    return last
+    if keep:
+        # First, since a run that resumes from the last one does not write its number again.
+        atomic.write(folder / f"update-{state['update']:06d}.pt", content.getbuffer())
+    atomic.write(folder / LAST, content.getbuffer())
+    return folder / LAST
 
 
 def files(run: str | Path) -> list[Path]:
@@ -135,6 +123,19 @@ def last(run: str | Path) -> Path:
     file = Path(run) / FOLDER / LAST
     of_rust = file.with_suffix(RUST_SUFFIX)
     return of_rust if of_rust.exists() and not file.exists() else file
+
+
+def protected(path: str | Path) -> list[Path]:
+    """The files that a program that reads this checkpoint must not overwrite: the checkpoint, and the other files of its run.
+
+    Args:
+        path: As for `load`.
+    """
+    file = last(path) if Path(path).is_dir() else Path(path)
+    if file.parent.name != FOLDER:
+        return [file]
+    run = file.parent.parent
+    return [file, run / SETTINGS, run / PROGRESS, *file.parent.glob("*")]
 
 
 def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:

@@ -8,7 +8,8 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
@@ -125,6 +126,19 @@ def parse(
     given = joined(_repeatable(arguments), sys.argv[1:] if given is None else given)
     known = tyro.MISSING_NONPROP if default is None else default
     return tyro.cli(arguments, prog=name, description=description(text), args=given, default=known)
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
+    """Check that a command does not write into a file that it reads, by whatever name, nor twice into one file.
+
+    Raises:
+        ValueError: It would.
+    """
+    given, read = [output for output in outputs if output is not None], list(inputs)
+    for number, output in enumerate(given):
+        for other in (*read, *given[:number]):
+            if output.resolve() == other.resolve() or (output.is_file() and other.is_file() and output.samefile(other)):
+                raise ValueError(f"cannot write {output}, which is the file {other}; choose another file")
 
 
 def joined(repeatable: Collection[str], given: Sequence[str]) -> list[str]:

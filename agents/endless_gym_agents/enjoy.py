@@ -110,6 +110,7 @@ def execute(arguments: EnjoyArguments) -> None:
     if not arguments.seeds:
         raise ValueError("--seeds must contain at least one seed, got none")
     video.check(arguments.out)
+    command.check_outputs([arguments.out], checkpoint.protected(arguments.checkpoint))
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)
     console = command.Terminal()

@@ -21,14 +21,14 @@ from typing import Any
 
 import torch
 import tyro
-from safetensors.torch import save, save_file
+from safetensors.torch import save
 
 from endless_gym.create import make_vec
 from endless_gym.printable import printable
 from endless_gym.specs import spec
-from endless_gym_agents import command
+from endless_gym_agents import atomic, command
 from endless_gym_agents.agent import Agent
-from endless_gym_agents.checkpoint import CHECKPOINT_VERSION, Checkpoint, load
+from endless_gym_agents.checkpoint import CHECKPOINT_VERSION, Checkpoint, load, protected
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.metrics import TASK_PROGRESS
 from endless_gym_agents.ranges import Positive
@@ -163,21 +163,22 @@ def execute(arguments: ExportArguments) -> None:
     """Write the files that the arguments name."""
     if arguments.out is None and arguments.vectors is None and arguments.weights is None:
         raise ValueError("nothing to write; add --out FILE, --weights FILE or --vectors FILE")
+    command.check_outputs((arguments.out, arguments.weights, arguments.vectors), protected(arguments.source))
     checkpoint = load(arguments.source)
     agent = checkpoint.agent
     if arguments.weights is not None:
-        save_file(weights(agent), arguments.weights)
+        atomic.write(arguments.weights, save(weights(agent)))
     if arguments.out is not None or arguments.vectors is not None:
         check(agent.settings, agent)
     if arguments.out is not None:
         for tensor in agent.state_dict().values():
             tensor.copy_(tensor.bfloat16())
         evaluation = evaluations(agent)
-        arguments.out.write_bytes(export(checkpoint, evaluation))
+        atomic.write(arguments.out, export(checkpoint, evaluation))
         print(f"{printable(arguments.out)}: {arguments.out.stat().st_size} bytes, {evaluation}")
     if arguments.vectors is not None:
         vectors = record_vectors(agent, arguments.vector_steps)
-        arguments.vectors.write_text(json.dumps(vectors, separators=(",", ":")) + "\n")
+        atomic.write(arguments.vectors, json.dumps(vectors, separators=(",", ":")) + "\n")
 
 
 def main() -> int:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import math
+import os
 import secrets
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from endless_gym_agents import regular
+from endless_gym_agents import atomic, regular
 from endless_gym_agents.clock import duration
 from endless_gym_agents.command import Terminal
 from endless_gym_agents.settings import Settings, to_dict
@@ -25,6 +28,10 @@ RECENT = 100
 _LONG = 86_400.0
 
 
+class MissingRow(ValueError):
+    """The log of a run has no row of an update before its last one, or before the run's checkpoint."""
+
+
 class Logger:
     """Writes the metrics of each update."""
 
@@ -34,8 +41,12 @@ class Logger:
         Args:
             run: Folder of the run.
             settings: Settings of the run.
-            update: Number of updates so far; entries of later updates are removed.
+            update: Number of updates so far. What follows their rows is cut off: rows of later updates, and the part of a row
+                that a killed process wrote.
             steps: Number of environment steps so far.
+
+        Raises:
+            MissingRow: There is no row of one of these updates.
         """
         from torch.utils.tensorboard import SummaryWriter
 
@@ -43,11 +54,13 @@ class Logger:
         self._updates = settings.ppo.updates
         self._recent: deque[float] = deque(maxlen=20)
         self._has_warned = False
-        progress = run / PROGRESS
-        if progress.exists():
-            kept = [row for row in read_progress(run) if row["update"] <= update]
-            progress.write_text("".join(f"{json.dumps(row)}\n" for row in kept))
-        self._progress = progress.open("a")
+        self._progress = (run / PROGRESS).open("ab")
+        ends = [0, *(end for _, end in itertools.islice(_rows(run), update))]
+        if len(ends) <= update:
+            raise MissingRow(
+                f"{run / PROGRESS} has no row of update {len(ends)}, and the checkpoint is of update {update}; {_help(run)}"
+            )
+        self._progress.truncate(ends[update])
         # The axis is environment steps, in which runs of different settings can be compared.
         self._board: Any = SummaryWriter(str(run), purge_step=steps + 1)  # type: ignore[no-untyped-call]
         rows = "\n".join(f"|{name}|{value}|" for name, value in _flat(to_dict(settings)))
@@ -63,7 +76,7 @@ class Logger:
         """
         row = metrics | {f"seconds/{name}": value for name, value in seconds.items()}
         numbers = {name: None if math.isnan(value) else value for name, value in row.items()}
-        self._progress.write(json.dumps(numbers) + "\n")
+        self._progress.write(f"{json.dumps(numbers)}\n".encode())
         self._progress.flush()
         update, steps = metrics["update"], metrics["steps"]
         for name, value in row.items():
@@ -96,6 +109,10 @@ class Logger:
                 "--total-steps, or a GPU"
             )
 
+    def sync(self) -> None:
+        """Wait until the rows are on disk. A checkpoint must not outlive the rows of its updates when the machine fails."""
+        os.fsync(self._progress.fileno())
+
     def print(self, text: str) -> None:
         """Print a line on the terminal."""
         self.console.print(text)
@@ -117,6 +134,9 @@ class SilentLogger(Logger):
     def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
         pass
 
+    def sync(self) -> None:
+        pass
+
     def print(self, text: str) -> None:
         pass
 
@@ -131,14 +151,34 @@ def means(episodes: Collection[dict[str, float]]) -> dict[str, float]:
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:
-    """The rows of `progress.jsonl`, one per update; an incomplete last line, from a killed process, is ignored."""
-    rows = []
-    for line in regular.text(run / PROGRESS).splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-    return rows
+    """The rows of `progress.jsonl`, one per update; an incomplete last line, from a killed process, is ignored.
+
+    Raises:
+        MissingRow: There is no row of an update before the last one.
+    """
+    return [row for row, _ in _rows(run)]
+
+
+def _rows(run: Path) -> Iterator[tuple[dict[str, Any], int]]:
+    """The rows as for `read_progress`, each with its end in bytes."""
+    with regular.opened(run / PROGRESS) as file:
+        lines, end = file.readlines(), 0
+    for number, line in enumerate(lines, 1):
+        row = None
+        with contextlib.suppress(ValueError, RecursionError):
+            row = json.loads(line) if line.endswith(b"\n") else None
+        if row is None and number == len(lines):
+            return
+        if not isinstance(row, dict) or row.get("update") != number:
+            raise MissingRow(
+                f"{run / PROGRESS} must have the row of update {number} in line {number}, got {line[:40]!r}; {_help(run)}"
+            )
+        end += len(line)
+        yield row, end
+
+
+def _help(run: Path) -> str:
+    return f"restore the file, or start a new run with --init-from {run}"
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
@@ -160,7 +200,7 @@ def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:
     # A resumed run keeps its id.
     kept = run / "wandb-id.txt"
     if not kept.exists():
-        kept.write_text(secrets.token_hex(4))
+        atomic.write(kept, secrets.token_hex(4))
     given: dict[str, Any] = {"id": regular.text(kept), "name": run.name, "dir": str(run), "config": to_dict(settings)}
     try:
         return wandb.init(project="endless-gym", resume="allow", **given)

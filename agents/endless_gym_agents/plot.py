@@ -23,7 +23,7 @@ from typing import Literal
 import tyro
 
 from endless_gym.printable import printable
-from endless_gym_agents import command, metrics
+from endless_gym_agents import atomic, command, metrics
 from endless_gym_agents.curves import (
     AXES,
     FAMILIES,
@@ -132,9 +132,10 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend()
-    figure.savefig(out / f"{name}.png", dpi=150)
+    with atomic.replacing(out / f"{name}.png") as picture:
+        figure.savefig(picture, dpi=150, format="png")
 
-    with (out / f"{name}.csv").open("w", newline="") as file:
+    with atomic.replacing(out / f"{name}.csv") as new, new.open("w", newline="") as file:
         writer = csv.writer(file)
         if spread == "runs":
             writer.writerow(["source", "label", "run", scale.name, "score"])
@@ -151,7 +152,7 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
         | {scale.name: curve.steps.tolist(), "scores": curve.scores.tolist()}
         for curve in curves
     ]
-    (out / f"{name}.json").write_text(json.dumps({"axis": axis, "curves": data}) + "\n")
+    atomic.write(out / f"{name}.json", json.dumps({"axis": axis, "curves": data}) + "\n")
     return out / f"{name}.png"
 
 
@@ -195,6 +196,8 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
         steps = arguments.max_steps
         curves = [curve.until(steps) if steps else curve for curve in curves]
         if curves:
+            outputs = [arguments.out / f"{name}.{kind}" for kind in ("png", "csv", "json")]
+            command.check_outputs(outputs, [path for path in arguments.paths if path.is_file()])
             plots.append(draw(name, axis, curves, arguments.spread, arguments.out))
 
     if arguments.aggregate != "no":

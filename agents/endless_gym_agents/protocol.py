@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from endless_gym_agents import checkpoint, command, metrics, tables
+from endless_gym_agents import atomic, checkpoint, command, metrics, tables
 from endless_gym_agents.evaluate import EVALUATION_SEEDS, REPETITIONS, evaluate
 from endless_gym_agents.ranges import Natural, Positive
 from endless_gym_agents.results import Experiment, Experiments, Run, to_json
@@ -187,6 +187,10 @@ def execute(arguments: EvalArguments) -> None:
     """Evaluate the checkpoints, and write or print the results."""
     if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
         raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
+    if arguments.json not in ("", "-"):
+        runs = find(arguments.paths, arguments.last)
+        read = [file for _, files in runs for file in checkpoint.protected(files[0])]
+        command.check_outputs([Path(arguments.json)], read)
     messages, start = command.Terminal(stderr=True), time.monotonic()
     failed: list[str] = []
     found = evaluate_runs(arguments, messages, failed)
@@ -206,7 +210,7 @@ def execute(arguments: EvalArguments) -> None:
         print(json.dumps(written, indent=1))
     else:
         if arguments.json:
-            Path(arguments.json).write_text(json.dumps(written) + "\n")
+            atomic.write(arguments.json, json.dumps(written) + "\n")
         console = command.Terminal()
         for experiment in experiments:
             tables.show(table(experiment), console)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from endless_gym.printable import printable
 from endless_gym_agents import checkpoint
+from endless_gym_agents.logs import PROGRESS
 from endless_gym_agents.settings import Settings
 
 #: File in the folder of a run while a process trains there. The process holds a lock on it; its text says which process that is.
@@ -35,7 +36,7 @@ def opened(settings: Settings, restarts: int = 0) -> Iterator[tuple[str, bool]]:
         restarts: How often `torchrun` has restarted the run.
 
     Yields:
-        The folder, and whether it contains a checkpoint of this run, to resume from.
+        The folder, and whether it contains a run that has begun, to resume from its checkpoint.
 
     Raises:
         RunInUse: Another process trains in the folder.
@@ -60,8 +61,10 @@ def opened(settings: Settings, restarts: int = 0) -> Iterator[tuple[str, bool]]:
                 raise FileExistsError(
                     f"{run} already contains a run; continue it with --resume {run}, or choose another folder"
                 )
-            has_begun = bool(restarts) and (run / checkpoint.FOLDER / checkpoint.LAST).exists()
-            yield str(run), bool(settings.resume) or has_begun
+            progress = run / PROGRESS
+            # The first checkpoint is older than the first row.
+            has_begun = checkpoint.last(run).exists() or (progress.exists() and progress.stat().st_size > 0)
+            yield str(run), has_begun and bool(settings.resume or restarts)
     finally:
         if is_new:
             with contextlib.suppress(OSError):  # It has files.

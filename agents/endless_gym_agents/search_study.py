@@ -11,7 +11,6 @@ import contextlib
 import fcntl
 import json
 import logging
-import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -22,7 +21,7 @@ from typing import IO, Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from endless_gym_agents import checkpoint, ranges, tables
+from endless_gym_agents import atomic, checkpoint, ranges, tables
 from endless_gym_agents.experiments.planning import flags
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.ranges import FromZero, Natural, Positive, Range
@@ -383,9 +382,7 @@ class Trials:
                 for trial in self.study.trials
             ]
             found = {"reward": done[0].value, "trial": done[0].number, "settings": best, "trials": trials}
-            temporary = self.folder / f"{BEST}.new"
-            temporary.write_text(json.dumps(found, indent=1) + "\n")
-            os.replace(temporary, self.folder / BEST)
+            atomic.write(self.folder / BEST, json.dumps(found, indent=1) + "\n")
             settings, changed = self.arguments.settings, self.changed(done[0].params)
             start = f"--env {settings.env} --preset {settings.preset}"
             start += "" if "--agent" in changed else f" --agent {settings.agent}"

@@ -26,7 +26,7 @@ import torch
 
 from endless_gym import EngineLost
 from endless_gym.episodes import EpisodeOptions
-from endless_gym_agents import checkpoint, command, run_folder
+from endless_gym_agents import atomic, checkpoint, command, run_folder
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
@@ -43,7 +43,7 @@ def train(
     watch: Callable[[int, dict[str, float]], bool] | None = None,
     episode_options: EpisodeOptions | None = None,
 ) -> Path:
-    """Train an agent in a new run, or resume a run from its last checkpoint.
+    """Train an agent in a new run, or resume a run from its last checkpoint. A run that ended before its first one starts again.
 
     Under `torchrun`, every process calls this function with the same settings. A run that `torchrun` restarts continues from its
     last checkpoint.
@@ -60,6 +60,7 @@ def train(
     Raises:
         RankLost: Another process of the run has ended.
         ValueError: The settings are invalid, or do not fit the run to resume.
+        MissingRow: The log of the run to resume has no row of an update before its checkpoint.
         RunInUse: Another process trains in the folder.
         FileExistsError: The folder already contains a run.
         FileNotFoundError: There is no run to resume.
@@ -92,10 +93,11 @@ def train_rank(
 ) -> Path:
     """The part of `train` that runs while the ranks are connected and the folder `run` is locked."""
     resumed: dict[str, Any] | None = None
-    if has_begun:
+    if settings.resume or has_begun:
         check_resumable(settings, checkpoint.read_settings(run))
-        resumed = checkpoint.load(run).resumable()
         settings = dataclasses.replace(settings, resume="", run=str(run))
+    if has_begun:
+        resumed = checkpoint.load(run).resumable()
 
     torch.manual_seed(settings.seed)
     generators = {
@@ -144,12 +146,13 @@ def train_rank(
                 "player": players[0] if ranks.size == 1 else {"ranks": players},
                 "episodes": list(episodes),
             }
+            logger.sync()
             checkpoint.save(run, state, keep)
 
         logger = Logger(run, settings, update, steps) if ranks.is_first else SilentLogger()
         # Written only after everything above has succeeded. A resumed run keeps its changed settings.
         if ranks.is_first:
-            (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
+            atomic.write(run / checkpoint.SETTINGS, json.dumps(to_dict(settings), indent=1) + "\n")
         if resumed is None:
             save(settings.keep_checkpoints)
         where = f"{device}" if ranks.size == 1 else f"{ranks.size} ranks"

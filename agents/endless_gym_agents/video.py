@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from endless_gym_agents import atomic
+
 #: A frame of a video, uint8 (HEIGHT, WIDTH, 3), indexed [row][column][channel].
 Frame = NDArray[np.uint8]
 
@@ -66,7 +68,7 @@ def check(file: Path) -> None:
 
 
 def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
-    """Write a video; if writing is interrupted, no partial file remains.
+    """Write a video. If writing is interrupted, no partial file remains, and a former file keeps its content.
 
     Args:
         file: Output file, with the suffix `.gif`, `.webp` (lossless) or `.mp4`.
@@ -80,17 +82,14 @@ def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
     """
     check(file)
     suffix, images = file.suffix.lower(), map(Image.fromarray, frames)
-    partial = file.with_name(f".{file.name}.partial{suffix}")
-    try:
+    with atomic.replacing(file) as new:
         if suffix == ".gif":
-            _animation(partial, (image.convert("P", palette=Image.Palette.ADAPTIVE) for image in images), fps)
+            reduced = (image.convert("P", palette=Image.Palette.ADAPTIVE) for image in images)
+            _animation(new, reduced, fps, format="GIF")
         elif suffix == ".webp":
-            _animation(partial, images, fps, lossless=True)
+            _animation(new, images, fps, format="WEBP", lossless=True)
         else:
-            _mp4(partial, iter(frames), fps)
-        partial.replace(file)
-    finally:
-        partial.unlink(missing_ok=True)
+            _mp4(new, iter(frames), fps)
 
 
 def _animation(file: Path, images: Iterator[Image.Image], fps: int, **options: Any) -> None:
@@ -101,7 +100,7 @@ def _mp4(file: Path, frames: Iterator[Frame], fps: int) -> None:
     first = next(frames)
     height, width, _ = first.shape
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
-    arguments = [_ffmpeg(), "-y", "-loglevel", "error", *source, "-pix_fmt", "yuv420p", str(file)]
+    arguments = [_ffmpeg(), "-y", "-loglevel", "error", *source, "-pix_fmt", "yuv420p", "-f", "mp4", str(file)]
     with subprocess.Popen(arguments, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
         try:

@@ -5,6 +5,7 @@ import os
 import pty
 import random
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from agents_helpers import changed, settings
 from endless_gym_agents import checkpoint, enjoy, protocol
 from endless_gym_agents import train as training
 from endless_gym_agents.command import STOP_SIGNALS
-from endless_gym_agents.logs import read_progress
+from endless_gym_agents.logs import MissingRow, read_progress
 from endless_gym_agents.run_folder import RunInUse
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.train import parse, train
@@ -107,7 +108,7 @@ def test_a_process_killed_at_random_moments_loses_at_most_one_update(number: sig
     # Programs that a shell has started in the background ignore SIGINT, and so do their children.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     for kill in range(int(os.environ.get("ENDLESS_KILLS", "3"))):
-        arguments = f"--resume {run}" if (run / "checkpoints" / "last.pt").exists() else f"{flags} --run {run}"
+        arguments = f"--resume {run}" if (run / "settings.json").exists() else f"{flags} --run {run}"
         with subprocess.Popen(
             [*program, *arguments.split()], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         ) as process:
@@ -133,6 +134,59 @@ def test_a_process_killed_at_random_moments_loses_at_most_one_update(number: sig
     given = parse([*flags.split(), "--run", str(tmp_path / "whole"), "--ppo.updates", str(known)])
     whole = checkpoint.load(train(given)).agent.state_dict()
     assert all(torch.equal(part, whole[name]) for name, part in checkpoint.load(run).agent.state_dict().items())
+
+
+@pytest.mark.timeout(600)
+def test_a_run_killed_at_any_call_that_changes_its_files_continues_with_one_command(tmp_path: Path) -> None:
+    """Without hard links, as on some file systems."""
+    library, tests = tmp_path / "kill_at.so", Path(__file__).parent
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tests / "kill_at.c", "-ldl"], check=True)
+    given = {"LD_PRELOAD": str(library), "PYTHONPATH": f"{tests}:{os.environ.get('PYTHONPATH', '')}"}
+    done = subprocess.run(
+        [sys.executable, tests / "kills.py", tmp_path],
+        env=os.environ | given,
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    kills = [int(line.split()[0]) for line in done.stdout.splitlines() if line.endswith(" kills")]
+    assert len(kills) == 2 and min(kills) > 20, kills
+
+
+def test_a_missing_row_is_an_error(tmp_path: Path) -> None:
+    run = train(small("none", tmp_path / "run"))
+    file = run / "progress.jsonl"
+    one, two, three = rows = file.read_text().splitlines(keepends=True)
+    for text, update in (
+        ("", 1),
+        (two + three, 1),
+        (one + three, 2),
+        (one + two[1:] + three, 2),
+        ("".join(rows).strip(), 3),
+    ):
+        file.write_text(text)
+        with pytest.raises(MissingRow, match=f"row of update {update}"):
+            train(replace(small("none", tmp_path, updates=4), resume=str(run)))
+        assert file.read_text() == text
+    # Without its checkpoint, a run that has begun does not start again.
+    file.write_text("".join(rows))
+    (run / "checkpoints" / "last.pt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint .*last\.pt"):
+        train(replace(small("none", tmp_path, updates=4), resume=str(run)))
+
+
+def test_a_run_without_a_checkpoint_starts_again_from_its_settings(tmp_path: Path) -> None:
+    weights = train(small("none", tmp_path / "weights", updates=1))
+    given = replace(small("none", tmp_path / "run"), init_from=str(weights))
+    run, expected = train(given), train(replace(given, run=str(tmp_path / "expected")))
+    shutil.rmtree(run / "checkpoints")
+    (run / "progress.jsonl").write_text("")
+    with pytest.raises(FileExistsError, match=f"continue it with --resume {run}"):
+        train(given)
+    train(parse(["--resume", str(run)]))
+    one, two = (checkpoint.load(each).agent.state_dict() for each in (run, expected))
+    assert all(torch.equal(part, two[name]) for name, part in one.items())
 
 
 def test_an_ignored_hang_up_stays_ignored(tmp_path: Path) -> None:

@@ -1,6 +1,9 @@
 """Exported agents, in the format that the browser page reads."""
 
+import errno
 import json
+import os
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +12,9 @@ import pytest
 import torch
 from agents_helpers import changed, saved, settings
 from safetensors import safe_open
+from safetensors.torch import load_file
 
-from endless_gym_agents import checkpoint, export
+from endless_gym_agents import atomic, checkpoint, enjoy, export, protocol
 
 ID = "MortarMayhem-Grid-v0"
 ROOT = Path(__file__).resolve().parents[2]
@@ -62,6 +66,64 @@ def test_agents_that_the_page_cannot_compute_are_refused(tmp_path: Path) -> None
     run = trained(tmp_path, agent="lstm")
     with pytest.raises(ValueError, match="--agent must be gru, mingru, gated-deltanet, mamba2, retnet, none, got lstm"):
         export.execute(export.ExportArguments(run, out=tmp_path / "agent.safetensors"))
+
+
+def test_what_is_read_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, other = trained(tmp_path / "run"), trained(tmp_path / "other")
+    (run / "settings.json").write_text("{}")
+    (run / "checkpoints" / "update-000001.pt").write_text("an earlier one")
+    last = run / "checkpoints" / "last.pt"
+    os.link(last, tmp_path / "linked.gif")
+    (tmp_path / "symbolic.json").symlink_to(last)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    monkeypatch.chdir(run)
+    for source in (run, Path("."), last, tmp_path / "linked.gif"):
+        with pytest.raises(ValueError, match=r"cannot write .*, which is the file .*; choose another file"):
+            export.execute(export.ExportArguments(source, weights=tmp_path / "linked.gif"))
+    for out in ("checkpoints/last.pt", last, "checkpoints/update-000001.pt", "settings.json", "../symbolic.json"):
+        for execute in (
+            lambda out: export.execute(export.ExportArguments(run, weights=Path(out))),
+            lambda out: export.execute(export.ExportArguments(run, out=Path(out))),
+            lambda out: export.execute(export.ExportArguments(run, vectors=Path(out))),
+            lambda out: protocol.execute(protocol.EvalArguments((other, run), json=str(out), seeds=1, repetitions=1)),
+        ):
+            with pytest.raises(ValueError, match="cannot write"):
+                execute(out)
+    with pytest.raises(ValueError, match=r"cannot write .*linked\.gif"):
+        enjoy.execute(enjoy.EnjoyArguments(run, out=tmp_path / "linked.gif"))
+    with pytest.raises(ValueError, match="cannot write"):
+        export.execute(export.ExportArguments(run, weights=Path("a"), vectors=Path("../run/a")))
+    assert before == {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    # An exported file is no part of a run.
+    export.execute(export.ExportArguments(last, weights=run / "weights.safetensors"))
+    assert set(load_file(run / "weights.safetensors")) == set(checkpoint.load(run).agent.state_dict())
+
+
+def test_a_failed_write_keeps_the_former_file(tmp_path: Path) -> None:
+    file, former = tmp_path / "agent.safetensors", b"former" * 1000
+    atomic.write(file, former)
+    # A link that another user planted under the name of the temporary file.
+    (tmp_path / "victim").write_text("kept")
+    (tmp_path / "agent.safetensors.new").symlink_to("victim")
+    process = os.fork()
+    if not process:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+        try:
+            atomic.write(file, former)
+        except OSError as error:
+            os._exit(error.errno)
+        finally:
+            os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == errno.EFBIG
+    assert file.read_bytes() == former and (tmp_path / "victim").read_text() == "kept"
+    assert not (tmp_path / "agent.safetensors.new").is_symlink()
+    # A link is followed, and a pipe is no file to replace.
+    (tmp_path / "link").symlink_to("agent.safetensors")
+    atomic.write(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink() and file.read_text() == "new"
+    reading, writing = os.pipe()
+    atomic.write(f"/dev/fd/{writing}", b"piped")
+    assert os.read(reading, 9) == b"piped"
 
 
 def test_the_program_writes_both_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

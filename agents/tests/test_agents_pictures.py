@@ -171,6 +171,14 @@ def test_a_task_with_other_options_is_not_compared_silently(tmp_path: Path, caps
         assert not capsys.readouterr().err
 
 
+def test_a_plot_does_not_overwrite_the_results_that_it_shows(tmp_path: Path) -> None:
+    file = results(tmp_path / "MysteryPath-v0.json", experiment("MysteryPath-v0", "task_progress", "gru", [[0.5]]))
+    before = file.read_bytes()
+    with pytest.raises(ValueError, match=r"cannot write .*MysteryPath-v0\.json"):
+        draw_all(PlotArguments((file,), tmp_path))
+    assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
+
+
 def test_spreads_runs_and_iqm(tmp_path: Path) -> None:
     scores = [[0.0], [0.1], [0.2], [0.3], [1.0]]
     file = results(tmp_path / "results.json", experiment("MysteryPath-v0", "task_progress", "gru", scores))

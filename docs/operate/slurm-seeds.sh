@@ -8,7 +8,7 @@
 run="runs/mortar-$SLURM_ARRAY_TASK_ID"
 arguments=(--env Endless-MortarMayhem-v0 --agent gru --seed "$SLURM_ARRAY_TASK_ID" --run "$run")
 # A job that was requeued or submitted again resumes its run.
-if [[ -e $run/checkpoints/last.pt ]]; then
+if [[ -e $run/settings.json ]]; then
     arguments=(--resume "$run")
 fi
 srun --cpus-per-task="$SLURM_CPUS_PER_TASK" endless-train "${arguments[@]}"

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from endless_gym_agents import metrics, regular, results
+from endless_gym_agents import atomic, metrics, regular, results
 from endless_gym_agents.curves import AXES, FAMILIES, Curve, aggregate, evaluated, published
 from endless_gym_agents.experiments import planning
 from endless_gym_agents.experiments.definitions import Run
@@ -63,14 +63,14 @@ def write(jobs: Sequence[Job], folder: Path, scale: float) -> Path:
     for figure in figures:
         text += ["", f"![{figure.stem}]({figure.name})"]
     page = folder / "README.md"
-    page.write_text("\n".join(text) + "\n")
+    atomic.write(page, "\n".join(text) + "\n")
     return page
 
 
 def _table(rows: Sequence[Row], file: Path) -> list[str]:
     """Write a table as CSV, and return its lines in Markdown."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    with file.open("w", newline="") as opened:
+    with atomic.replacing(file) as new, new.open("w", newline="") as opened:
         writer = csv.DictWriter(opened, columns)
         writer.writeheader()
         writer.writerows(rows)

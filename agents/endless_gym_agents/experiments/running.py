@@ -18,7 +18,7 @@ from typing import IO, Protocol
 
 import torch
 
-from endless_gym_agents import checkpoint
+from endless_gym_agents import atomic, checkpoint
 from endless_gym_agents.clock import duration
 from endless_gym_agents.command import on_stop_signals
 from endless_gym_agents.experiments import planning
@@ -197,7 +197,7 @@ class Runner:
         self._active.remove(active)
         job, minutes = active.job, (time.monotonic() - active.begun) / 60
         if status == 0 and job.experiment.kind == "search":
-            (job.folder / planning.FINISHED).write_text("{}\n")
+            atomic.write(job.folder / planning.FINISHED, "{}\n")
         if job.state() == "done":
             if job.experiment.kind == "curves" and not self.keep_checkpoints:
                 for file in (job.folder / checkpoint.FOLDER).glob("update-*.pt"):

@@ -7,13 +7,12 @@ import json
 import os
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from endless_gym.env import Env
-from endless_gym_agents import command
+from endless_gym_agents import atomic, command
 
 
 def measure(env_id: str, episodes: int) -> list[float]:
@@ -49,7 +48,7 @@ def main() -> int:
         rates = measure(given.env, given.episodes)
         result = {"mean": float(np.mean(rates)), "std": float(np.std(rates)), "episodes": len(rates)}
         result["load_average"] = os.getloadavg()[0]
-        Path(given.json).write_text(json.dumps(result) + "\n")
+        atomic.write(given.json, json.dumps(result) + "\n")
 
     return command.run("endless-speed", execute)
 

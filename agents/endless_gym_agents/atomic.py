@@ -1,0 +1,46 @@
+"""Files that are replaced as a whole, so that a killed program or a full disk leaves the former content."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing(file: str | Path) -> Iterator[Path]:
+    """Yield the path of a new file in the same folder, which replaces `file` once the block has ended and it is on disk.
+
+    A link is followed. What is not a regular file, such as a pipe or `/dev/stdout`, is yielded itself.
+
+    Raises:
+        OSError: The file cannot be written; it then has its former content.
+    """
+    file = Path(file)
+    if (file.exists() and not file.is_file()) or str(file).startswith(("/dev/std", "/dev/fd/", "/proc/")):
+        yield file
+        return
+    file = Path(os.path.realpath(file))
+    new = file.with_name(f"{file.name}.new")
+    # What a killed process left. It may also be a link, whose target must not be written.
+    new.unlink(missing_ok=True)
+    try:
+        yield new
+        with new.open("rb") as written:
+            os.fsync(written.fileno())
+        os.replace(new, file)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            new.unlink()
+        raise
+
+
+def write(file: str | Path, content: str | bytes | memoryview) -> None:
+    """Replace a file by this content, text as UTF-8.
+
+    Raises:
+        OSError: As for `replacing`.
+    """
+    with replacing(file) as new:
+        new.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -1,0 +1,73 @@
+"""Kills a run at each of its calls that change a file, and continues it: `LD_PRELOAD=kill_at.so python kills.py FOLDER`."""
+
+import ctypes
+import itertools
+import os
+import shutil
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+# Each forked process would import it for seconds.
+import torch._dynamo  # noqa: F401
+from test_agents_training import progress, same, small
+
+from endless_gym_agents import checkpoint
+from endless_gym_agents.train import train
+
+
+def ended(work: Callable[[], object]) -> int:
+    """Do the work in a process of its own, and return 0 or the signal that has ended it."""
+    process = os.fork()
+    if not process:
+        try:
+            work()
+            os._exit(0)
+        except Exception:
+            traceback.print_exc()
+        finally:
+            os._exit(1)
+    status = os.waitpid(process, 0)[1]
+    assert status in (0, signal.SIGKILL), status
+    return status
+
+
+def main() -> None:
+    """Kill and continue a new run, and a run that resumes."""
+    folder, library = Path(sys.argv[1]), ctypes.CDLL(None)
+    run, whole, half = (folder / name for name in ("run", "whole", "half"))
+    given = replace(small("gru", run), keep_checkpoints=True)
+    resume = replace(given, run="", resume=str(run))
+    ended(lambda: train(replace(given, run=str(whole))))
+    ended(lambda: train(replace(small("gru", half, 2), keep_checkpoints=True)))
+    with (half / "progress.jsonl").open("a") as file:
+        file.write('{"update": 3}\n{"upda')
+
+    def killed(number: int) -> None:
+        library.kill_at(os.fsencode(run), number)
+        train(resume if run.exists() else given)
+
+    for is_resumed in (False, True):
+        for number in itertools.count(1):
+            shutil.rmtree(run, ignore_errors=True)
+            if is_resumed:
+                shutil.copytree(half, run)
+            status = ended(lambda number=number: killed(number))
+            again = resume if (run / "settings.json").exists() else given
+            assert ended(lambda again=again: train(again)) == 0, f"after call {number}"
+            assert progress(run) == progress(whole), f"after call {number}"
+            one, two = (checkpoint.load(each).state for each in (run, whole))
+            for part in ("update", "model", "optimizer", "generators", "player", "episodes"):
+                assert same(one[part], two[part]), f"{part} after call {number}"
+            names = [[file.name for file in sorted((each / "checkpoints").iterdir())] for each in (run, whole)]
+            assert names[0] == names[1], f"{names} after call {number}"
+            if status == 0:
+                break
+        print(f"{number - 1} kills")
+
+
+if __name__ == "__main__":
+    main()
