@@ -25,7 +25,7 @@ from endless_gym._native import __version__, running_engines
 from endless_gym.env import Env
 from endless_gym.exceptions import EngineLost, TooManyBatchesHeld
 from endless_gym.experts import Experts
-from endless_gym.interop import DLPackView, pin_memory, torch_view
+from endless_gym.interop import DLPackView, torch_view
 from endless_gym.registration import register, register_envs
 from endless_gym.replay import ReplayStep, replay
 from endless_gym.specs import Frames, all_specs, spec
@@ -54,7 +54,6 @@ __all__ = [
     "all_specs",
     "connect",
     "make_vec",
-    "pin_memory",
     "record",
     "register",
     "register_envs",

@@ -1,6 +1,6 @@
 """Types of the native module, which the package wraps."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -59,7 +59,10 @@ class Backend:
     def close(self) -> None: ...
 
 class Pools(Backend):
-    def __init__(self, configs: Sequence[str], num_threads: int) -> None: ...
+    # `allocate` returns a tensor of that many zeroed bytes that nothing else uses; it must not run Python code.
+    def __init__(
+        self, configs: Sequence[str], num_threads: int, allocate: Callable[[int], Any] | None = None
+    ) -> None: ...
     def layout(self) -> str: ...
     def ground_truth_view(self, env: int) -> NDArray[np.uint8]: ...
 

@@ -19,6 +19,7 @@ from endless_gym.configuration import (
     options_list,
 )
 from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
+from endless_gym.interop import PageLocks, cuda_to_pin, page_locked_bytes
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.results import Results
 from endless_gym.specs import Frames, ObservationName, described_spec, json_text
@@ -39,6 +40,7 @@ def make_vec(
     frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
+    pin_memory: bool = False,
     independent_episodes: bool = False,
     first_env: int = 0,
     total_envs: int | None = None,
@@ -72,6 +74,8 @@ def make_vec(
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.
+        pin_memory: Step into memory that PyTorch page-locks, so that copies to a CUDA device are asynchronous. Without CUDA, this
+            warns and does nothing.
         independent_episodes: Start every episode as in a new environment, so that it depends only on its seed and its reset
             parameters, and draw a seed for each episode without one. By default, as in the original, the first frames of an
             episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with the
@@ -87,7 +91,7 @@ def make_vec(
 
     Raises:
         TypeError: A number is not an integer, or `episode_options` cannot be called.
-        ValueError: An argument is out of its range.
+        ValueError: An argument is out of its range, or both `copy` and `pin_memory` are given.
     """
     given = checked_arguments(
         id,
@@ -104,7 +108,8 @@ def make_vec(
         first_env,
         total_envs,
     )
-    pools = given.described.native.Pools([json_text(config) for config in given.pools], given.num_threads)
+    allocate = None if cuda_to_pin(pin_memory, copy) is None else page_locked_bytes()
+    pools = given.described.native.Pools([json_text(config) for config in given.pools], given.num_threads, allocate)
     layout = json.loads(pools.layout())
     return _environments(
         pools,
@@ -123,6 +128,7 @@ def connect(
     *,
     timeout: float = 30.0,
     copy: bool = False,
+    pin_memory: bool = False,
     render_mode: str | None = None,
     view: View | None = None,
     episode_options: EpisodeOptions | None = None,
@@ -135,6 +141,8 @@ def connect(
         service: The engine's name.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        pin_memory: Page-lock the shared memory until the environments are closed or reconnected, so that copies to a CUDA device
+            are asynchronous. This takes one of the engine's `batches_held`. Without CUDA, this warns and does nothing.
         render_mode: As for `make_vec`.
         view: As for `make_vec`.
         episode_options: As for `make_vec`. It is called in this process; options that differ from the environment's last ones
@@ -145,12 +153,16 @@ def connect(
 
     Raises:
         ConnectionError: There is no such engine, or it already has a trainer.
-        ValueError: The timeout is negative or not finite, or there is no such render mode or view.
+        ValueError: The timeout is negative or not finite, there is no such render mode or view, both `copy` and `pin_memory` are
+            given, or the engine lends only the batch that `pin_memory` holds.
     """
     timeout = checked_timeout(timeout)
     checked_view(render_mode, view, VECTOR_MODES)
+    cuda = cuda_to_pin(pin_memory, copy)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
+    if cuda is not None and specification["batches_held"] == 1:
+        raise ValueError("pin_memory holds one batch, and the engine lends 1; start it with 2 or more batches held")
     return _environments(
         connection,
         specified_results(specification, copy),
@@ -163,6 +175,7 @@ def connect(
         view=view,
         first_env=specification["first_env"],
         engine=engine,
+        locks=None if cuda is None else PageLocks(cuda),
     )
 
 

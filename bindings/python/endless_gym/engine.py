@@ -134,6 +134,7 @@ def serve(
     resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
+    pin_memory: bool = False,
     independent_episodes: bool = False,
     first_env: int = 0,
     total_envs: int | None = None,
@@ -171,6 +172,7 @@ def serve(
             existing file is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        pin_memory: As for `connect`; the engine lends one extra batch for it.
         independent_episodes: As for `make_vec`.
         first_env: As for `make_vec`.
         total_envs: As for `make_vec`.
@@ -181,7 +183,8 @@ def serve(
 
     Raises:
         TypeError: A number is not an integer.
-        ValueError: An argument is out of its range; or `checkpoint_every` or `resume` is given without `checkpoint`.
+        ValueError: An argument is out of its range, `checkpoint_every` or `resume` is given without `checkpoint`, or both `copy`
+            and `pin_memory` are given.
         RuntimeError: The engine cannot start; the message says why.
     """
     given = checked_arguments(
@@ -216,7 +219,7 @@ def serve(
         "pool": {**given.pools[0], "options": given_options},
         "groups": len(given.pools),
         "threads": given.num_threads,
-        "batches_held": min(batches + bool(episode_info), _native.MAX_BATCHES_HELD),
+        "batches_held": min(batches + bool(episode_info) + bool(pin_memory), _native.MAX_BATCHES_HELD),
         "checkpoint": saved,
     }
     engine = EngineProcess(config)
@@ -224,6 +227,7 @@ def serve(
         return engine.connect(
             timeout,
             copy=copy,
+            pin_memory=pin_memory,
             render_mode=render_mode,
             view=view,
             episode_options=episode_options,

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import os
 import sys
 import warnings
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -81,24 +85,6 @@ def torch_view(array: NDArray[Any]) -> torch.Tensor:
     return torch.from_numpy(_native.writable_view(array))
 
 
-def pin_memory(array: NDArray[Any]) -> bool:
-    """Page-lock the array's memory, so that `tensor.to("cuda", non_blocking=True)` is asynchronous.
-
-    The whole mapping is page-locked, with all batches in it; one call for each group of an engine is enough. Without CUDA, this
-    warns and does nothing.
-
-    Args:
-        array: Any array of a step.
-
-    Returns:
-        Whether the memory is page-locked.
-    """
-    reason = _pin(array)
-    if reason is not None:
-        warnings.warn(f"memory is not page-locked: {reason}", stacklevel=2)
-    return reason is None
-
-
 def mapping_of(address: int, size: int = 1) -> tuple[int, int]:
     """First address and size in bytes of the memory mappings of this process that contain `size` bytes at `address`."""
     start = None
@@ -113,27 +99,82 @@ def mapping_of(address: int, size: int = 1) -> tuple[int, int]:
     raise ValueError(f"no mapping at address {address:#x}")
 
 
-_PINNED: set[int] = set()
 _READ_ONLY = 8
-_ALREADY_REGISTERED = 712
 
 
-def _pin(array: NDArray[Any]) -> str | None:
-    """Page-locks the array's memory. Returns the reason if that fails."""
+def cuda_to_pin(pin_memory: bool, copy: bool) -> Any:
+    """`torch.cuda` for the arguments of an environment; `None` without `pin_memory`, and with a warning without a device.
+
+    Raises:
+        ValueError: Copies cannot be in page-locked memory.
+    """
+    if not pin_memory:
+        return None
+    if copy:
+        raise ValueError(
+            "pin_memory page-locks the memory that the engine writes, and copy=True copies out of it; omit one"
+        )
     try:
         import torch
     except ImportError:
-        return "PyTorch is not installed"
-    if not torch.cuda.is_available():
-        return "PyTorch finds no CUDA device"
-    first, size = mapping_of(array.ctypes.data, array.nbytes)
-    if first in _PINNED:
-        return None
-    runtime = torch.cuda.cudart()
-    # An engine's memory is mapped read-only, for which CUDA requires a flag.
-    for flags in (_READ_ONLY, 0):
-        status = int(runtime.cudaHostRegister(first, size, flags))
-        if status in (0, _ALREADY_REGISTERED):
-            _PINNED.add(first)
-            return None
-    return f"CUDA refuses to register {size} bytes, with error {status}"
+        reason = "PyTorch is not installed"
+    else:
+        if torch.cuda.is_available():
+            return torch.cuda
+        reason = "PyTorch finds no CUDA device"
+    warnings.warn(f"memory is not page-locked: {reason}", stacklevel=3)
+    return None
+
+
+def page_locked_bytes() -> Callable[[int], torch.Tensor]:
+    """Allocates tensors of page-locked zeros, uint8 (bytes,), without running Python code."""
+    import torch
+
+    return functools.partial(torch.zeros, dtype=torch.uint8, pin_memory=True)
+
+
+class PageLocks:
+    """Page-locks the shared memory of an engine's groups, one mapping each, until `release`.
+
+    CUDA would keep reading the old pages if other memory were mapped at the same address in the meantime. So an array of each
+    mapping is kept, which keeps the mapping.
+    """
+
+    def __init__(self, cuda: Any) -> None:
+        """`cuda` is `torch.cuda`."""
+        self._cuda, self._process = cuda, os.getpid()
+        # By group; `None` for one whose memory cannot be page-locked.
+        self._locked: dict[int, tuple[int, NDArray[Any]] | None] = {}
+
+    def lock(self, group: int, arrays: Sequence[NDArray[Any]]) -> None:
+        """Page-lock a group's memory at its first batch, of which these are the arrays."""
+        if group in self._locked:
+            return
+        array = next(array for array in arrays if not array.flags.owndata)
+        first, size = mapping_of(array.ctypes.data, array.nbytes)
+        # Before the call, after which a signal handler may raise.
+        self._locked[group] = first, array
+        # The memory is mapped read-only, for which CUDA requires a flag on most systems.
+        for flags in (_READ_ONLY, 0):
+            status = int(self._cuda.cudart().cudaHostRegister(first, size, flags))
+            if status == 0:
+                return
+        self._locked[group] = None
+        # PyTorch reports CUDA's last error in the next operation.
+        import torch
+
+        with contextlib.suppress(RuntimeError):
+            torch.zeros(1, device="cuda")
+        warnings.warn(f"memory is not page-locked: CUDA refuses {size} bytes, with error {status}", stacklevel=3)
+
+    def release(self) -> None:
+        """Wait for the copies from the memory, and unlock it."""
+        locked, self._locked = [each for each in self._locked.values() if each is not None], {}
+        if not locked or self._process != os.getpid():
+            return
+        for device in range(self._cuda.device_count()):
+            # A device without memory is the target of no copy, and waiting for it would initialise it.
+            if self._cuda.memory_reserved(device):
+                self._cuda.synchronize(device)
+        for first, _ in locked:
+            self._cuda.cudart().cudaHostUnregister(first)

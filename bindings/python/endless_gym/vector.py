@@ -20,6 +20,7 @@ from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import Options
 from endless_gym.descriptions import documented, metadata
 from endless_gym.exceptions import TooManyBatchesHeld
+from endless_gym.interop import PageLocks
 from endless_gym.next_options import NextOptions, RunningEpisode, running_episodes
 from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.reset_requests import ResetRequests, Seeds
@@ -86,11 +87,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         view: View | None = None,
         first_env: int = 0,
         engine: Any = None,
+        locks: PageLocks | None = None,
     ) -> None:
         """Called by `make_vec` and `connect`.
 
         `options` are those given at creation: one mapping for all environments, or one for each of all groups. `knows_options` is
-        false if the environments may have others. `engine` is the engine's process if it belongs to this object.
+        false if the environments may have others. `engine` is the engine's process if it belongs to this object, and `locks`
+        page-locks the engine's memory.
         """
         described = results.described
         shown = checked_view(render_mode, view, VECTOR_MODES)
@@ -98,6 +101,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)
         self._backend = backend
         self._engine = engine
+        self._locks = locks
         self._results = results
         self._described = described
         #: The id's entry in Gymnasium's registry; `None` for an id that is not registered, such as one of an engine of your own.
@@ -376,7 +380,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             arrays = self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None)
             self._has_begun = True
             self._kept[group] = None
-            return self._results.start(arrays)
+            return self._results.start(self._page_locked(group, arrays))
 
     def render(self, group: int = 0) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
         """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
@@ -458,6 +462,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         timeout = checked_timeout(timeout)
         if not isinstance(self._backend, _native.Connection):
             raise RuntimeError("the environments are in this process; there is no engine to reconnect to")
+        if self._locks is not None:
+            self._locks.release()
         restarted, incarnation, groups = self._backend.reconnect(timeout)
         for group in range(self.num_groups if restarted else 0):
             self._options.forget(group, range(self.num_envs))
@@ -466,11 +472,12 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def close_extras(self, **kwargs: Any) -> None:
         """Disconnect, and stop the engine if `serve` started it. Arrays remain valid."""
         self._kept[:] = [None] * self.num_groups
-        try:
-            self._backend.close()
-        finally:
+        with contextlib.ExitStack() as last_first:
             if self._engine is not None:
-                self._engine.end()
+                last_first.callback(self._engine.end)
+            last_first.callback(self._backend.close)
+            if self._locks is not None:
+                last_first.callback(self._locks.release)
 
     def __enter__(self) -> EndlessVectorEnv:
         return self
@@ -501,7 +508,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         with self._turns[group]:
             text = self._before_reset(group, envs, given)
             try:
-                start = self._results.start(self._backend.reset(group, request, text))
+                arrays = self._page_locked(group, self._backend.reset(group, request, text))
+                start = self._results.start(arrays)
             except (TimeoutError, TooManyBatchesHeld):
                 # `recv` can still return the result.
                 self._sent_reset(group, envs, given, text)
@@ -519,7 +527,12 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _received(self, group: int, arrays: _native.Arrays) -> Step:
         """The result of a step, or of a reset that was sent."""
         self._has_begun = True
-        return self._results.step(arrays)
+        return self._results.step(self._page_locked(group, arrays))
+
+    def _page_locked(self, group: int, arrays: _native.Arrays) -> _native.Arrays:
+        if self._locks is not None:
+            self._locks.lock(group, arrays)
+        return arrays
 
     def _sent_reset(self, group: int, envs: Sequence[int], given: Options, text: str | None) -> None:
         self._options.started(group, envs, given, text)

@@ -68,13 +68,15 @@ struct State {
 #[pymethods]
 impl Pools {
     /// Makes one group for each configuration, which is JSON text. There must be at least one, and all must have the same id and
-    /// number of environments. They share `num_threads` threads, one per core for 0.
+    /// number of environments. They share `num_threads` threads, one per core for 0. `allocate` is that of [`Buffers::new`].
     #[new]
-    fn new(py: Python<'_>, configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
+    #[pyo3(signature = (configs, num_threads, allocate=None))]
+    fn new(py: Python<'_>, configs: Vec<String>, num_threads: usize, allocate: Option<Py<PyAny>>) -> PyResult<Self> {
         let threads = Threads::new(num_threads).map_err(errors::pool)?;
         let group = |config: &String| {
             let pool = Pool::new(environments(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
-            Ok(Group { pool, buffers: Buffers::default(), actions: Vec::new() })
+            let buffers = Buffers::new(allocate.as_ref().map(|allocate| allocate.clone_ref(py)));
+            Ok(Group { pool, buffers, actions: Vec::new() })
         };
         let pools: Vec<Group> = configs.iter().map(group).collect::<PyResult<_>>()?;
         let first = &pools.first().ok_or_else(errors::closed)?.pool;
@@ -292,7 +294,7 @@ impl Group {
         work: impl FnOnce(&mut Pool, &mut [Block]) -> Result<(), PoolError> + Send,
     ) -> PyResult<Bound<'py, PyTuple>> {
         let pool = &mut self.pool;
-        let (index, batch) = self.buffers.free(pool.layout());
+        let (index, batch) = self.buffers.free(py, pool.layout())?;
         py.detach(|| work(pool, batch)).map_err(errors::pool)?;
         arrays::sections(&Bound::new(py, self.buffers.lease(index))?, self.pool.layout())
     }
