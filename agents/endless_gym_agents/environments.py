@@ -57,7 +57,11 @@ class Environments:
     """
 
     def __init__(
-        self, settings: Settings, episode_options: EpisodeOptions | None = None, ranks: Ranks | None = None
+        self,
+        settings: Settings,
+        episode_options: EpisodeOptions | None = None,
+        ranks: Ranks | None = None,
+        pin_memory: bool = False,
     ) -> None:
         """Make the environments, in this process or in an engine process.
 
@@ -66,6 +70,7 @@ class Environments:
             episode_options: Chooses the options of each episode, as for `make_vec`; only with environments in this process, since
                 the replacement for a failed engine replays steps.
             ranks: The ranks of the run, each with a share of the environments; `None` for this process alone.
+            pin_memory: Page-lock the memory of the results, as for `make_vec`.
 
         Raises:
             ValueError: A reset parameter is unknown or out of its range, the engine cannot start, or `episode_options` is given
@@ -95,6 +100,7 @@ class Environments:
             "observation": wanted.observation,
             "first_env": own.start,
             "total_envs": wanted.num_envs,
+            "pin_memory": pin_memory,
         }
         make = partial(make_vec, settings.env, **arguments, episode_options=episode_options)
         self._view: ViewProcess | None = None

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,7 +23,7 @@ from endless_gym_agents.encoders import FRAME, Observation
 from endless_gym_agents.environments import Environments, StepResult
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.repeats import EmbeddedFrames
-from endless_gym_agents.transfers import HostCopy, Upload
+from endless_gym_agents.transfers import HostCopy, Upload, host_tensor
 from endless_gym_agents.transforms import Identity, TransformState
 
 
@@ -153,6 +152,8 @@ class RolloutCollector:
         self._parts = [self._columns(self._slice(group)) for group in range(groups)]
         self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]
         self._uploads = [Upload(device) for _ in range(groups)]
+        # Rewards and ends of episodes, for their upload.
+        self._outcomes = [host_tensor((2, per_group), torch.float32, device).numpy() for _ in range(groups)]
 
     def collect(self, clock: Clock) -> tuple[Segment, list[dict[str, float]]]:
         """Collect one segment.
@@ -184,7 +185,7 @@ class RolloutCollector:
             with clock.measure("stepping"):
                 episodes += self._receive(group, self.steps - 1)
             with clock.measure("inference"):
-                value = self.agent.bootstrap_value(self.current[group].observation, memory)
+                value = self.agent.bootstrap_value(self._uploaded(group), memory)
                 self._last_value[self._slice(group)] = value
         return self._segment(), episodes
 
@@ -218,19 +219,22 @@ class RolloutCollector:
 
     def _act(self, group: int, step: int, noise: Tensor, clock: Clock) -> None:
         memory, current, part, agent = self.memories[group], self.current[group], self._parts[group], self.agent
+        upload = self._uploads[group]
         with clock.measure("inference"):
             slots, update = part.observation[step], TransformState()
             if isinstance(agent.transform, Identity):
                 # Copy straight into the segment, where the network reads it.
                 for key, value in agent.as_mapping(current.observation).items():
-                    self._uploads[group].copy(key, value, slots[key])
+                    upload.copy(value, slots[key])
                 observed = slots
             else:
-                observed, update = agent.observe(agent.to_tensors(current.observation), memory)
+                observed, update = agent.observe(self._uploaded(group), memory)
             decision = agent.decide(observed, memory, noise, self._embedded(group, step))
             actions = self._actions[group]
             actions.start(decision.action)
             actions.wait()
+            # Releases arrays. It does not wait: these copies were begun before that of the actions.
+            upload.wait()
         with clock.measure("stepping"):
             self.environments.send(actions.array, group)
         with clock.measure("inference"):
@@ -242,7 +246,12 @@ class RolloutCollector:
             part.action[step].copy_(decision.action)
             part.outputs[step].copy_(decision.outputs)
             if part.ground_truth and current.ground_truth is not None:
-                self._uploads[group].copy("ground truth", current.ground_truth, part.ground_truth[step])
+                upload.copy(current.ground_truth, part.ground_truth[step])
+
+    def _uploaded(self, group: int) -> Observation:
+        """The current observation of a group, in tensors of its own on the agent's device."""
+        given = self.agent.as_mapping(self.current[group].observation)
+        return self.agent.to_tensors({key: self._uploads[group].tensor(value) for key, value in given.items()})
 
     def _embedded(self, group: int, step: int) -> Tensor | None:
         """What `Agent.embed` returns for an observation in the segment; None without the cache of equal frames."""
@@ -257,8 +266,9 @@ class RolloutCollector:
         result = self.environments.receive(group)
         self.current[group] = result
         outcome = self._parts[group].outcome[step + 1]
-        # One copy for both.
-        self._uploads[group].copy("outcome", np.array([result.reward, result.done], np.float32), outcome)
+        # One copy for both. `_act` has waited for the last one.
+        self._outcomes[group][0], self._outcomes[group][1] = result.reward, result.done
+        self._uploads[group].copy(self._outcomes[group], outcome)
         memory = self.memories[group]
         memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
         return result.episodes

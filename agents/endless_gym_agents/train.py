@@ -106,7 +106,7 @@ def train_rank(
     }
 
     ppo, started, stop = settings.ppo, time.monotonic(), Interrupt(ranks)
-    with stop, Environments(settings, episode_options, ranks) as environments:
+    with stop, Environments(settings, episode_options, ranks, pin_memory=device.type != "cpu") as environments:
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()

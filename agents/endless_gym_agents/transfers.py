@@ -1,7 +1,7 @@
-"""Copies between the host and the agent's device; only the copy of the actions waits.
+"""Copies between the host and the agent's device.
 
-On the CPU, NumPy makes the copies, since its calls cost less, and nothing waits. On CUDA, copies go through page-locked memory
-and are asynchronous.
+Copies to and from a device other than the CPU are asynchronous if the host's memory is page-locked, as that of environments made
+with `pin_memory` is. CUDA first copies other memory. On the CPU, NumPy makes the copies, since its calls cost less.
 """
 
 from __future__ import annotations
@@ -16,7 +16,32 @@ from torch import Tensor
 from endless_gym.interop import torch_view
 
 
-class HostCopy:
+def host_tensor(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """An uninitialised tensor on the host for copies to or from `device`, page-locked unless that is the CPU."""
+    return torch.empty(shape, dtype=dtype, pin_memory=device.type != "cpu")
+
+
+class _Copies:
+    """Copies on the current stream of a device."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._module = None if device.type == "cpu" else torch.get_device_module(device)
+        self._done = None if self._module is None else self._module.Event()
+
+    def _begin(self, source: Tensor, target: Tensor) -> None:
+        target.copy_(source, non_blocking=True)
+        if self._module is not None and self._done is not None:
+            # The current device may be another one.
+            self._done.record(self._module.current_stream(self._device))
+
+    def wait(self) -> None:
+        """Wait until the copies that were begun are complete."""
+        if self._done is not None:
+            self._done.synchronize()
+
+
+class HostCopy(_Copies):
     """A copy of a device tensor on the host: `start` begins the copy, and `wait` waits for it.
 
     Attributes:
@@ -24,49 +49,45 @@ class HostCopy:
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> None:
-        """Allocate the memory on the host, page-locked for CUDA."""
-        self._cuda = device.type == "cuda"
-        self._tensor = torch.empty(shape, dtype=dtype, pin_memory=self._cuda)
-        self._done = torch.cuda.Event() if self._cuda else None
+        """Allocate the memory on the host."""
+        super().__init__(device)
+        self._tensor = host_tensor(shape, dtype, device)
         self.array: NDArray[Any] = self._tensor.numpy()
 
     def start(self, tensor: Tensor) -> None:
-        """Begin to copy `tensor`; on CUDA, later operations on the same stream do not delay the copy."""
-        self._tensor.copy_(tensor, non_blocking=True)
-        if self._done is not None:
-            # The tensor's device need not be the current one.
-            self._done.record(torch.cuda.current_stream(tensor.device))
-
-    def wait(self) -> None:
-        """Wait until the copy is complete."""
-        if self._done is not None:
-            self._done.synchronize()
+        """Begin to copy `tensor`; later operations on the same stream do not delay the copy."""
+        self._begin(tensor, self._tensor)
 
 
-class Upload:
-    """Copies host arrays, by name, to device tensors.
+class Upload(_Copies):
+    """Copies of host arrays on a device. The arrays must not change, and are kept, until `wait` returns.
 
-    For CUDA, the array is first copied to page-locked memory of this process. The engine's shared memory is not page-locked
-    itself: it is unmapped when the engine fails, and CUDA would keep reading the old pages.
+    The engine does not write to the memory of arrays that are kept.
     """
 
     def __init__(self, device: torch.device) -> None:
         """Prepare for copies to `device`."""
-        self._on_host, self._cuda = device.type == "cpu", device.type == "cuda"
-        self._staged: dict[str, Tensor] = {}
+        super().__init__(device)
+        self._kept: list[NDArray[Any]] = []
 
-    def copy(self, name: str, array: NDArray[Any], target: Tensor) -> None:
-        """Begin to copy `array` to `target`, of equal shape; the array may change afterwards.
-
-        The previous copy under this name must be complete. It is once the actions of a later step have arrived, since copies are
-        executed in order.
-        """
-        if self._on_host:
+    def copy(self, array: NDArray[Any], target: Tensor) -> None:
+        """Begin to copy `array` to `target`, of equal shape."""
+        if self._done is None:
             np.copyto(target.numpy(), array)
             return
-        source = torch_view(array)
-        if self._cuda:
-            if name not in self._staged:
-                self._staged[name] = torch.empty(source.shape, dtype=source.dtype, pin_memory=True)
-            source = self._staged[name].copy_(source)
-        target.copy_(source, non_blocking=True)
+        self._kept.append(array)
+        self._begin(torch_view(array), target)
+
+    def tensor(self, array: NDArray[Any]) -> Tensor:
+        """A tensor on the device to which `array` is being copied; on the CPU, one that shares its memory."""
+        view = torch_view(array)
+        if self._done is None:
+            return view
+        target = torch.empty_like(view, device=self._device)
+        self.copy(array, target)
+        return target
+
+    def wait(self) -> None:
+        """Wait until the copies that were begun are complete, and release their arrays."""
+        super().wait()
+        self._kept.clear()

@@ -124,7 +124,7 @@ def segment_of(agent: Agent, memory: AgentMemory, observed: dict[str, torch.Tens
 @contextmanager
 def collecting(given: Settings, device: str = "cpu") -> Iterator[RolloutCollector]:
     """A collector of segments with a new agent."""
-    with Environments(given) as environments:
+    with Environments(given, pin_memory=torch.device(device).type != "cpu") as environments:
         torch.manual_seed(1)
         agent = make_agent(given, environments.spec, device)
         yield RolloutCollector(agent, environments, given.ppo.steps, torch.Generator(device).manual_seed(1))

@@ -1,16 +1,20 @@
 """A stand-in for a CUDA device on machines without one.
 
 A tensor of this device wraps a CPU tensor. As on CUDA, it is an error to mix tensors of both devices in an operation or to access
-the data without a copy. Run as a program, this trains on the device and on the CPU, and prints the results of both as JSON:
+the data without a copy. Copies with `non_blocking` between page-locked memory and the device are complete only when the host
+waits: then the host receives what was copied, and it is an error if memory that was being uploaded has changed or is not mapped.
+
+Run as a program, this trains on the device and on the CPU, and prints the results of both as JSON:
 
     python other_device.py FOLDER FLAGS_AS_JSON ...
 """
 
 import contextlib
 import json
+import os
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +23,8 @@ import torch
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
+
+from endless_gym import create, interop
 
 NAME = "elsewhere"
 
@@ -55,6 +61,101 @@ WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equ
 waits: Counter[str] = Counter()
 #: Number of copies from the CPU to the device by shape.
 uploads: Counter[tuple[int, ...]] = Counter()
+#: Addresses and sizes of page-locked memory, with the mapping of memory that `cudaHostRegister` locked.
+locked: dict[int, tuple[int, str | None]] = {}
+#: Tensors in page-locked memory, which stays so, as that of PyTorch's allocator.
+allocated: list[torch.Tensor] = []
+#: Copies in flight, in order: the address on the host, and what completes the copy.
+in_flight: list[tuple[int, Callable[[], None]]] = []
+
+
+def complete(count: int | None = None) -> None:
+    """Wait for the first `count` copies in flight, or for all."""
+    done, in_flight[:] = in_flight[:count], in_flight[len(in_flight) if count is None else count :]
+    for _, finish in done:
+        finish()
+
+
+def mapping(address: int) -> str:
+    """The line of the mapping that contains an address, with its file; empty for none."""
+    with open("/proc/self/maps") as maps:
+        for line in maps:
+            first, end = (int(number, 16) for number in line.split(maxsplit=1)[0].split("-"))
+            if first <= address < end:
+                # Names of files that were removed get a suffix.
+                return line.removesuffix(" (deleted)\n").strip()
+    return ""
+
+
+def memory_at(address: int, size: int) -> bytes:
+    """The bytes at an address, which need not be mapped."""
+    with open("/proc/self/mem", "rb", buffering=0) as memory:
+        try:
+            return os.pread(memory.fileno(), size, address)
+        except OSError:
+            return b""
+
+
+def begin(address: int, size: int, finish: Callable[[], None]) -> None:
+    """Complete a copy of host memory later, if it is page-locked."""
+    for first, (length, mapped) in locked.items():
+        if first <= address and address + size <= first + length:
+            if mapped is not None and mapping(first) != mapped:
+                raise RuntimeError("the device would use pages that were at this address before")
+            in_flight.append((address, finish))
+            return
+    finish()
+
+
+def uploading(source: torch.Tensor) -> None:
+    """Note that the device is reading a tensor on the host."""
+    assert source.is_contiguous()
+    # Without a reference to the tensor, which would keep its memory.
+    address, size = source.data_ptr(), source.nbytes
+    now = memory_at(address, size)
+    assert len(now) == size
+
+    def finish() -> None:
+        if memory_at(address, size) != now:
+            raise RuntimeError("host memory changed while the device was reading it")
+
+    begin(address, size, finish)
+
+
+class Event:
+    """As `torch.cuda.Event`."""
+
+    last = None
+
+    def record(self, stream: Any) -> None:
+        self.last = in_flight[-1] if in_flight else None
+
+    def synchronize(self) -> None:
+        if self.last in in_flight:
+            complete(in_flight.index(self.last) + 1)
+
+
+class Runtime:
+    """As CUDA's runtime, whose errors are numbers."""
+
+    @staticmethod
+    def cudaHostRegister(first: int, size: int, flags: int) -> int:
+        mapped = mapping(first)
+        if any(first < other + length and other < first + size for other, (length, _) in locked.items()):
+            return 712
+        if first % 4096 or size % 4096 or (flags != interop._READ_ONLY and mapped.split()[1][1] != "w"):
+            return 1
+        locked[first] = size, mapped
+        return 0
+
+    @staticmethod
+    def cudaHostUnregister(first: int) -> int:
+        size, mapped = locked.pop(first)
+        if mapping(first) != mapped:
+            raise RuntimeError("memory was unmapped before it was unlocked")
+        if any(first <= address < first + size for address, _ in in_flight):
+            raise RuntimeError("memory was unlocked while the device was using it")
+        return 0
 
 
 def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
@@ -68,12 +169,26 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         raise RuntimeError(f"{name}: tensors on two devices, of shapes {shapes[0]} and {shapes[1]}")
     to_cpu = name == "copy_" and bool(here) and here[0] is args[0]
     to_cpu |= name == "_to_copy" and torch.device(kwargs.get("device") or NAME).type == "cpu"
+    asked = kwargs.get("device")
+    is_later = args[2:] == (True,) if name == "copy_" else name == "_to_copy" and kwargs.get("non_blocking", False)
     if there and (to_cpu or name in WAITING):
         waits[name] += 1
-    asked = kwargs.get("device")
+        if not is_later:
+            complete()
+    if kwargs.pop("pin_memory", False):
+        made = operation(*args, **kwargs)
+        locked[made.data_ptr()] = made.nbytes, None
+        allocated.append(made)
+        return made
+    if to_cpu and is_later and there and name == "copy_":
+        target, copied = args[0], args[1].here.clone()
+        begin(target.data_ptr(), target.nbytes, lambda: target.copy_(copied))
+        return target
     into = isinstance(args[0], There) if name == "copy_" else name == "_to_copy" and asked is not None and not to_cpu
     if here and into:
         uploads[tuple(here[0].shape)] += 1
+        if is_later:
+            uploading(here[0])
     if asked is not None:
         kwargs = kwargs | {"device": torch.device("cpu")}
     own = REPLACED.get(name, operation)
@@ -131,6 +246,22 @@ REPLACED = {
 
 
 class Module(backend_registration._DummyBackendModule):
+    """As `torch.cuda`."""
+
+    Event = Event
+
+    def current_stream(self, device: Any) -> None:
+        return None
+
+    def cudart(self) -> type[Runtime]:
+        return Runtime
+
+    def memory_reserved(self, device: int) -> int:
+        return 1
+
+    def synchronize(self, device: int) -> None:
+        complete()
+
     def get_amp_supported_dtype(self) -> list[torch.dtype]:
         return [torch.bfloat16]
 
@@ -150,7 +281,7 @@ def register() -> None:
 @contextlib.contextmanager
 def device() -> Iterator[None]:
     """Context in which the device can be used."""
-    generator, save, to = torch.Generator, torch.save, torch.nn.Module.to
+    generator, save, to, cuda = torch.Generator, torch.save, torch.nn.Module.to, create.cuda_to_pin
     torch.Generator = Generator
 
     def moved(module: torch.nn.Module, *args: Any, **kwargs: Any) -> torch.nn.Module:
@@ -161,13 +292,14 @@ def device() -> Iterator[None]:
         return module
 
     torch.nn.Module.to = moved
+    create.cuda_to_pin = lambda pin_memory, copy: torch.get_device_module(NAME) if pin_memory else None
     # Files contain CPU tensors; for CUDA tensors, `map_location` has this effect.
     torch.save = lambda state, file: save(tree_map_only(There, lambda tensor: tensor.here.clone(), state), file)
     try:
         with Device():
             yield
     finally:
-        torch.Generator, torch.save, torch.nn.Module.to = generator, save, to
+        torch.Generator, torch.save, torch.nn.Module.to, create.cuda_to_pin = generator, save, to, cuda
 
 
 def main() -> None:
