@@ -6,7 +6,8 @@
   the device, in float32 without TF32. The largest difference, relative to the largest value, must be at most 1e-3.
 * Copies: frames of a group from pageable and from page-locked memory to the device.
 * Training: steps per second with a breakdown, and peak memory, with the networks, frames, environments and steps of the preset
-  `paper`, without and with `--compile`, and with more environments. The first updates are excluded as warm-up.
+  `paper`, without and with `--compile`, and with more environments; then with environments in this process and in an engine
+  process, otherwise with equal settings. The first updates are excluded as warm-up.
 
 `--device cpu` runs the parts that need no GPU with small networks and few steps, to test this program; its numbers mean nothing.
 The exit status is 1 if there is no CUDA device, or if a result on the device differs from the CPU's.
@@ -19,6 +20,7 @@ import platform
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,8 @@ TOLERANCE = 1e-3
 ENV = "Endless-MortarMayhem-v0"
 #: Environments, steps and `--compile` of the training measurements; the first are the paper's.
 TRAININGS = ((32, 512, False), (32, 512, True), (128, 512, False), (512, 128, False))
+#: Where the environments are and their number of groups, in measurements with many environments and bfloat16.
+ENGINES = (("thread", 1), ("process", 1), ("thread", 2), ("process", 2))
 #: Updates before the timed ones. With graphs, a part is compiled in its first call and captured in its third.
 WARM_UPS = 2
 
@@ -138,11 +142,27 @@ def training(settings: Settings, device: torch.device, updates: int) -> dict[str
         "agent": settings.agent,
         "num_envs": num_envs,
         "steps": steps,
+        "engine": settings.environment.engine,
+        "groups": settings.environment.groups,
+        "bf16": settings.bf16,
         "compile": settings.compile,
         "steps_per_second": updates * num_envs * steps / seconds,
         "shares_of_time": {name.removeprefix("seconds/"): sum(row[name] for row in rows) / seconds for name in phases},
         "peak_gigabytes": torch.cuda.max_memory_allocated(device) / 1e9 if cuda else None,
     }
+
+
+def trainings() -> Iterator[Settings]:
+    """The settings of the measurements on CUDA."""
+    paper = replace(PRESETS["paper"], env=ENV)
+    for num_envs, steps, compile in TRAININGS:
+        for agent in ("gru", "trxl"):
+            environment, ppo = replace(paper.environment, num_envs=num_envs), replace(paper.ppo, steps=steps)
+            yield replace(paper, agent=agent, compile=compile, environment=environment, ppo=ppo)
+    for engine, groups in ENGINES:
+        environment = replace(paper.environment, num_envs=1024, engine=engine, groups=groups)
+        many = replace(paper, bf16=True, environment=environment, ppo=replace(paper.ppo, steps=128))
+        yield replace(many, agent="gru", recurrence=replace(paper.recurrence, sequence_length=128))
 
 
 def markdown(report: dict[str, Any]) -> str:
@@ -159,16 +179,18 @@ def markdown(report: dict[str, Any]) -> str:
             kind = "page-locked" if row["page_locked"] else "pageable"
             lines.append(f"| {kind} | {row['gigabytes_per_second']:.1f} |")
     lines += ["", "## Training", ""]
-    lines += ["| agent | environments x steps | compiled | steps per second | share of time | peak memory |"]
-    lines += ["| --- | --- | --- | --- | --- | --- |"]
+    lines += [
+        "| agent | environments x steps | engine, groups | options | steps per second | share of time | peak memory |"
+    ]
+    lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
     for row in report["training"]:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in row["shares_of_time"].items())
         memory = "" if row["peak_gigabytes"] is None else f"{row['peak_gigabytes']:.1f} GB"
         batch = f"{row['num_envs']} x {row['steps']}"
-        compiled = "yes" if row["compile"] else "no"
-        lines.append(
-            f"| {row['agent']} | {batch} | {compiled} | {row['steps_per_second']:,.0f} | {shares} | {memory} |"
-        )
+        engine = f"{row['engine']}, {row['groups']}"
+        options = ", ".join(name for name in ("bf16", "compile") if row[name])
+        speed = f"{row['steps_per_second']:,.0f}"
+        lines.append(f"| {row['agent']} | {batch} | {engine} | {options} | {speed} | {shares} | {memory} |")
     for left_out in report["left_out"]:
         lines += ["", f"Not measured: {left_out}."]
     return "\n".join(lines) + "\n"
@@ -205,24 +227,19 @@ def main() -> int:
         # As in `endless-train`.
         torch.backends.cudnn.allow_tf32 = True
         torch.set_float32_matmul_precision("high")
-    paper = replace(PRESETS["paper"], env=ENV)
+    tests = [networks("gru"), networks("trxl")]
+    tests.append(replace(tests[0], environment=replace(tests[0].environment, engine="process", groups=2)))
     report["training"], report["left_out"] = [], []
-    for num_envs, steps, compile in TRAININGS if cuda else ((4, 16, False),):
-        for agent in ("gru", "trxl"):
-            settings = replace(paper, agent=agent) if cuda else networks(agent)
-            settings = replace(
-                settings,
-                compile=compile,
-                environment=replace(settings.environment, num_envs=num_envs),
-                ppo=replace(settings.ppo, steps=steps),
-            )
-            if (time.monotonic() - started) / 60 > args.minutes:
-                report["left_out"].append(f"{agent}, {num_envs} x {steps}")
-                continue
-            try:
-                report["training"].append(training(settings, device, args.updates))
-            except torch.cuda.OutOfMemoryError:
-                report["left_out"].append(f"{agent}, {num_envs} x {steps} (out of memory)")
+    for settings in trainings() if cuda else tests:
+        agent, environment = settings.agent, settings.environment
+        name = f"{agent}, {environment.num_envs} x {settings.ppo.steps}, {environment.engine}, {environment.groups}"
+        if (time.monotonic() - started) / 60 > args.minutes:
+            report["left_out"].append(name)
+            continue
+        try:
+            report["training"].append(training(settings, device, args.updates))
+        except torch.cuda.OutOfMemoryError:
+            report["left_out"].append(f"{name} (out of memory)")
     text = markdown(report)
     print(text)
     if args.json:

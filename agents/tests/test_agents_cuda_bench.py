@@ -26,9 +26,10 @@ def test_parts_that_need_no_gpu_run_on_the_cpu(tmp_path: Path) -> None:
     # On the CPU both sides are the same.
     assert [row["agent"] for row in report["equality"]] == list(AGENTS)
     assert all(row["largest_difference"] == 0.0 for row in report["equality"])
-    assert [(row["agent"], row["num_envs"], row["steps"]) for row in report["training"]] == [
-        ("gru", 4, 16),
-        ("trxl", 4, 16),
+    assert [(row["agent"], row["num_envs"], row["steps"], row["engine"]) for row in report["training"]] == [
+        ("gru", 4, 16, "thread"),
+        ("trxl", 4, 16, "thread"),
+        ("gru", 4, 16, "process"),
     ]
     for row in report["training"]:
         assert row["steps_per_second"] > 0
