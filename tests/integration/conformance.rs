@@ -39,6 +39,7 @@ const THREAD_MATTERS: u8 = 13;
 const FEATURE_INFINITE: u8 = 14;
 const TRUTH_OUTSIDE: u8 = 15;
 const ALLOCATES: u8 = 16;
+const FORGERY_ACCEPTED: u8 = 17;
 
 /// Numbers that belong to no environment.
 static RESETS: AtomicI64 = AtomicI64::new(0);
@@ -143,6 +144,10 @@ impl<const MISTAKE: u8> Task for Sum<MISTAKE> {
     fn info(&self, _: &i64, out: &mut [f64]) {
         out[0] = self.sum as f64 + if MISTAKE == INFO_FRACTION { 0.5 } else { 0.0 };
     }
+
+    fn is_valid(&self, _: &i64) -> bool {
+        MISTAKE == FORGERY_ACCEPTED || (0..100).contains(&self.sum)
+    }
 }
 
 /// The problems that the checks find.
@@ -174,6 +179,7 @@ fn each_seeded_mistake_is_found() {
         (problems::<Sum<ACTION_PANICS>>(), "panicked in environment 0, in an episode with seed 0: not implemented"),
         (problems::<Sum<LIMIT_PANICS>>(), "`start` = 10: Sum-v0 panicked in environment 0"),
         (problems::<Sum<THREAD_MATTERS>>(), "with three threads"),
+        (problems::<Sum<FORGERY_ACCEPTED>>(), "`is_valid` accepts a snapshot with the bytes "),
         (problems::<Sum<FEATURE_INFINITE>>(), "the feature `sum` is"),
     ];
     for (problems, expected) in found {

@@ -43,6 +43,10 @@ impl Task for Faulty {
 
     fn reset(&mut self, (): &(), _: &mut Generator) {}
 
+    fn is_valid(&self, (): &()) -> bool {
+        true
+    }
+
     fn step(&mut self, (): &(), action: &[i32], _: &mut Generator) -> Transition {
         match action[0] {
             TEXT => panic!("out of coins"),

@@ -49,6 +49,10 @@ impl<const WIDTH: usize, const HEIGHT: usize, const CHANNELS: usize> Task for Do
         canvas.draw_rect([1, 2, 3], Rect::new((self.place / HEIGHT) as i32, (self.place % HEIGHT) as i32, 1, 1), 0);
     }
 
+    fn is_valid(&self, _: &()) -> bool {
+        self.place < WIDTH * HEIGHT && self.sum.is_finite()
+    }
+
     fn write_pixels(&self, _: &(), pixels: &mut [u8]) {
         pixels[self.place * CHANNELS..][..CHANNELS].copy_from_slice(&[1, 2, 3, 4][..CHANNELS]);
     }

@@ -11,6 +11,7 @@ use crate::support::process::{Process, TIMEOUT, text, wait_until};
 use crate::support::service::{assert_rejected, reset, send, step, try_step};
 use endless_gym::pool::{PoolConfig, ResetRequest, Seeding};
 use endless_gym::service::{Observer, Rejection, Trainer};
+use endless_gym_core::conformance::seal;
 use rustix::process::Signal;
 use serde_json::Value as Json;
 
@@ -182,6 +183,47 @@ fn missing_and_damaged_checkpoints_are_told_apart() {
     assert_eq!(text(&damaged.stderr), message);
     for wrong in [vec!["--every=5m"], vec!["--resume"], vec![&checkpoint, "--every=soon"]] {
         assert_eq!(place.run(&[vec!["serve"], wrong].concat()).status.code(), Some(2));
+    }
+}
+
+#[test]
+fn a_forged_state_in_a_checkpoint_is_refused() {
+    let place = Place::new();
+    let file = place.root().join("state");
+    let arguments = ["serve", "--env=popgym-PositionOnlyPendulumEasy-v0", "--num-envs=1", "--service=gym", "--seed=4"];
+    let checkpoint = format!("--checkpoint={}", file.display());
+    let arguments = [&arguments[..], &[&checkpoint, "--resume"]].concat();
+    let serve = || Process::spawn(place.endless(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()));
+    let engine = serve();
+    let mut trainer = place.trainer("gym").unwrap();
+    reset(&mut trainer, 0);
+    step(&mut trainer, 0);
+    drop(trainer);
+    ended(engine, Signal::INT);
+    let good = std::fs::read(&file).unwrap();
+    let snapshot = good.windows(4).position(|bytes| bytes == b"EGYM").unwrap();
+    // The snapshot ends with angle, velocity, observation and steps; after it, the checkpoint has the empty list of earlier frames.
+    let velocity = good.len() - 1 - 1 - 8 - 8;
+    for (number, is_valid) in [(0.25_f64, true), (1e200, false), (f64::NAN, false), (-8.5, false)] {
+        let mut forged = good.clone();
+        forged[velocity..][..8].copy_from_slice(&number.to_le_bytes());
+        let end = good.len() - 1;
+        seal(&mut forged[snapshot..end]);
+        seal(&mut forged);
+        std::fs::write(&file, &forged).unwrap();
+        if is_valid {
+            let engine = serve();
+            let mut trainer = place.trainer("gym").unwrap();
+            trainer.reset(0, ResetRequest::Each { reset: &[0], seed: &[0] }).unwrap();
+            trainer.receive(0, TIMEOUT).unwrap();
+            assert!(step(&mut trainer, 0).batch().reward()[0].is_finite());
+            drop(trainer);
+            ended(engine, Signal::INT);
+        } else {
+            let refused = place.run(&arguments);
+            assert_eq!(refused.status.code(), Some(1), "{number}");
+            assert!(text(&refused.stderr).contains("the state has a number that is out of its range"));
+        }
     }
 }
 

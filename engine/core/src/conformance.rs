@@ -17,9 +17,9 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use serde_json::{Map, Value as Json, json};
 
 use crate::batch::{Batch, Block, Frames, zeroed};
-use crate::envs::{ActionSpace, EnvSpec, ObservationSpace, Parameter, ParameterKind, Task, UnknownEnvironment};
+use crate::envs::{ActionSpace, EnvSpec, InfoColumn, Parameter, ParameterKind, Task, UnknownEnvironment};
 use crate::pool::{
-    Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads, message,
+    Autoreset, HEAD, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads, message,
 };
 use crate::random::Generator;
 use crate::raster::PixelFormat;
@@ -51,6 +51,7 @@ const RULES: &[(&str, Rule)] = &[
     ("a snapshot continues identically", snapshots_continue),
     ("a changed frame equals one that is drawn in full", repaints),
     ("rewards and observations are finite and within the declared spaces", numbers_are_declared),
+    ("a forged snapshot is refused, or continues within the declared spaces", forgeries_are_refused),
     ("every choice of every action can be played", actions_are_playable),
     ("every reset parameter can be played at its limits", limits_are_playable),
 ];
@@ -140,6 +141,29 @@ impl Game {
         Ok(played)
     }
 
+    /// Restores every environment's own snapshot.
+    fn reload(&mut self) -> Result<(), String> {
+        for env in 0..self.pool.layout().num_envs() {
+            let snapshot = self.pool.snapshot(env).map_err(text)?;
+            self.pool.restore(env, &snapshot).map_err(text)?;
+            if self.pool.snapshot(env).map_err(text)? != snapshot {
+                return Err("a snapshot restores another state".to_owned());
+            }
+        }
+        Ok(())
+    }
+
+    /// Plays what was restored.
+    fn continue_forged(&mut self) -> Result<(), String> {
+        self.reload()?;
+        self.pool.observe(&mut self.blocks).map_err(text)?;
+        for step in 0..40 {
+            check_numbers(self.pool.spec(), &self.batch()).map_err(|problem| format!("{problem} after step {step}"))?;
+            self.play(1)?;
+        }
+        Ok(())
+    }
+
     /// One environment's part of the batch.
     fn row(&self, env: usize) -> Vec<u8> {
         let bytes = self.batch().bytes();
@@ -149,6 +173,13 @@ impl Game {
             &bytes[section.offset() + env * length..][..length]
         });
         rows.copied().collect()
+    }
+}
+
+/// Updates the checksum of a snapshot, or of an engine's checkpoint, whose bytes were changed.
+pub fn seal(snapshot: &mut [u8]) {
+    if let Some((head, content)) = snapshot.split_at_mut_checked(HEAD) {
+        head[8..].copy_from_slice(&crc32fast::hash(content).to_le_bytes());
     }
 }
 
@@ -224,10 +255,11 @@ fn is_alone(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
 }
 
 fn snapshots_continue(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
-    let mut game = Game::started(registry, &config(spec, 1), 11)?;
-    let mut other = Game::started(registry, &config(spec, 1), 500)?;
-    for start in [0, 1, 7, 40] {
-        game.reset(11 + start as u64)?;
+    use Autoreset::{Disabled, NextStep};
+    for (start, autoreset) in [(0, NextStep), (1, NextStep), (7, NextStep), (40, NextStep), (STEPS, Disabled)] {
+        let config = PoolConfig { autoreset, ..config(spec, 1) };
+        let mut game = Game::started(registry, &config, 11 + start as u64)?;
+        let mut other = Game::started(registry, &config, 500)?;
         game.play(start)?;
         other.play(3)?;
         other.pool.restore(0, &game.pool.snapshot(0).map_err(text)?).map_err(text)?;
@@ -259,61 +291,74 @@ fn repaints(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
 fn numbers_are_declared(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
     let mut game = Game::started(registry, &config(spec, NUM_ENVS), 17)?;
     for step in 0..=STEPS {
-        let batch = game.batch();
-        let at = |what: &str| format!("{what} after step {step}");
-        if let Some(reward) = batch.reward().iter().find(|reward| !reward.is_finite()) {
-            return Err(at(&format!("the reward is {reward}")));
-        }
-        for row in batch.features().chunks_exact(spec.features.len().max(1)) {
-            if let Some(number) = row.iter().position(|number| !number.is_finite()) {
-                return Err(at(&format!("the feature `{}` is {}", spec.features[number].name, row[number])));
-            }
-            if let Some(space) = spec.observation_space.filter(|space| !contains(space, row)) {
-                return Err(at(&format!("the features {row:?} are not in {space}")));
-            }
-        }
-        let (least, largest) = spec.ground_truth_bounds.unwrap_or((f32::MIN, f32::MAX));
-        let bounds = f64::from(least)..=f64::from(largest);
-        if let Some(number) = batch.ground_truth().iter().find(|number| !bounds.contains(number)) {
-            return Err(at(&format!("a number of the ground truth is {number}")));
-        }
-        for (env, row) in batch.info().chunks_exact(spec.info.len().max(1)).enumerate() {
-            let wrong = |(column, number): (&crate::envs::InfoColumn, &f64)| {
-                column.is_integer && batch.has_ended(env) && number.fract() != 0.0
-            };
-            if let Some(number) = spec.info.iter().zip(row).position(wrong) {
-                return Err(at(&format!(
-                    "the info `{}` is declared an integer, and is {}",
-                    spec.info[number].name, row[number]
-                )));
-            }
-        }
+        check_numbers(spec, &game.batch()).map_err(|problem| format!("{problem} after step {step}"))?;
         let actions = game.actions(NUM_ENVS);
         game.step(&actions)?;
     }
     Ok(())
 }
 
-/// Whether features are in their space.
-fn contains(space: &ObservationSpace, row: &[f32]) -> bool {
-    let is_choice = |number: &f32, choices: &i32| number.fract() == 0.0 && (0.0..*choices as f32).contains(number);
-    match space {
-        ObservationSpace::Discrete(choices) => is_choice(&row[0], choices),
-        ObservationSpace::MultiDiscrete(choices) => {
-            row.iter().zip(*choices).all(|(number, choices)| is_choice(number, choices))
+/// Checks that the rewards and observations of a batch are finite and within the spaces that the specification declares.
+///
+/// # Errors
+///
+/// The first number that is not, as text.
+pub fn check_numbers<'a>(spec: &EnvSpec, batch: &Batch<'a>) -> Result<(), String> {
+    if let Some(reward) = batch.reward().iter().find(|reward| !reward.is_finite()) {
+        return Err(format!("the reward is {reward}"));
+    }
+    let rows = |section: &'a [f32]| section.chunks_exact(spec.features.len().max(1)).enumerate();
+    let ended = rows(batch.final_features()).filter(|(env, _)| batch.has_ended(*env));
+    for (_, row) in rows(batch.features()).chain(ended) {
+        if let Some(number) = row.iter().position(|number| !number.is_finite()) {
+            return Err(format!("the feature `{}` is {}", spec.features[number].name, row[number]));
         }
-        ObservationSpace::Box { low, high } => {
-            row.iter().zip(low.iter().zip(*high)).all(|(number, (low, high))| (*low..=*high).contains(number))
-        }
-        ObservationSpace::Tuple(parts) => {
-            let mut rest = row;
-            parts.iter().all(|part| {
-                let (own, others) = rest.split_at(part.width());
-                rest = others;
-                contains(part, own)
-            })
+        if let Some(space) = spec.observation_space.filter(|space| !space.contains(row)) {
+            return Err(format!("the features {row:?} are not in {space}"));
         }
     }
+    let (least, largest) = spec.ground_truth_bounds.unwrap_or((f32::MIN, f32::MAX));
+    let bounds = f64::from(least)..=f64::from(largest);
+    if let Some(number) = batch.ground_truth().iter().find(|number| !bounds.contains(number)) {
+        return Err(format!("a number of the ground truth is {number}"));
+    }
+    for (env, row) in batch.info().chunks_exact(spec.info.len().max(1)).enumerate() {
+        let wrong =
+            |(column, number): (&InfoColumn, &f64)| column.is_integer && batch.has_ended(env) && number.fract() != 0.0;
+        if let Some(number) = spec.info.iter().zip(row).position(wrong) {
+            return Err(format!(
+                "the info `{}` is declared an integer, and is {}",
+                spec.info[number].name, row[number]
+            ));
+        }
+    }
+    Ok(())
+}
+
+fn forgeries_are_refused(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    let mut game = Game::started(registry, &config(spec, 1), 31)?;
+    game.play(7)?;
+    let (snapshot, mut random) = (game.pool.snapshot(0).map_err(text)?, Generator::from_seed(1));
+    for number in 0..2 * STEPS {
+        let mut forged = snapshot.clone();
+        let start = HEAD + number * (snapshot.len() - HEAD) / (2 * STEPS);
+        let float = *random.choice(&[f64::NAN, f64::INFINITY, -1e200, 1e9, f64::from_bits(1 << 63 | 1)]);
+        let bytes = match random.integers(0, 3) {
+            0 => float.to_le_bytes().to_vec(),
+            1 => (float as f32).to_le_bytes().to_vec(),
+            _ => vec![random.integers(0, 256) as u8],
+        };
+        forged.iter_mut().skip(start).zip(&bytes).for_each(|(to, byte)| *to = *byte);
+        seal(&mut forged);
+        if game.pool.restore(0, &forged).is_ok() {
+            let continued = catch_unwind(AssertUnwindSafe(|| game.continue_forged()));
+            let continued = continued.unwrap_or_else(|panic| Err(format!("it panicked: {}", message(&*panic))));
+            continued.map_err(|problem| {
+                format!("`is_valid` accepts a snapshot with the bytes {bytes:?} from {start} on, but {problem}")
+            })?;
+        }
+    }
+    Ok(())
 }
 
 fn actions_are_playable(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
@@ -345,7 +390,10 @@ fn limits_are_playable(registry: &Registry, spec: &EnvSpec) -> Result<(), String
                 autoreset: Autoreset::SameStep,
                 ..config(spec, NUM_ENVS)
             };
-            let play = || Game::started(registry, &config, 23)?.play(STEPS / 8);
+            let play = || {
+                let mut game = Game::started(registry, &config, 23)?;
+                (0..STEPS / 8).try_for_each(|_| game.play(1).and_then(|_| game.reload()))
+            };
             let played = catch_unwind(AssertUnwindSafe(play)).unwrap_or_else(|panic| Err(message(&*panic)));
             played.map_err(|error| format!("`{}` = {value}: {error}", parameter.name))?;
         }

@@ -63,6 +63,10 @@ impl Task for Toy {
     fn info(&self, _: &(), out: &mut [f64]) {
         out[0] = f64::from(self.x);
     }
+
+    fn is_valid(&self, _: &()) -> bool {
+        self.x >= 0
+    }
 }
 
 /// Ids with all sections (`Toy-v0`), with a vector and two branches (`Toy-Vector-v0`), and with nothing optional (`Toy-Plain-v0`). Only

@@ -87,7 +87,10 @@ impl Task for Autoencode {
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
-        self.deck.is_valid(parameters.decks, Face::Suit) && self.named < parameters.decks * DECK
+        let last = if self.named == 0 { Some(self.card) } else { self.deck.dealt(0) };
+        self.deck.is_valid(parameters.decks, Face::Suit, last)
+            && self.named < parameters.decks * DECK
+            && (self.named == 0 || self.deck.left() == 0 && self.card == 0)
     }
 
     fn expert(_: &str) -> Option<Box<dyn Expert>> {

@@ -1,5 +1,7 @@
 //! Battleship: find hidden ships; a shot only says whether it hit.
 
+use std::array;
+
 use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
 };
@@ -55,6 +57,21 @@ impl Battleship {
     }
 }
 
+/// Whether these ships, side by side, can cover exactly these squares.
+fn are_ships(squares: [u16; ROWS], ships: &[i64]) -> bool {
+    let Some(row) = squares.iter().position(|bits| *bits != 0) else { return ships.is_empty() };
+    // Some ship has its top or left end at the first square.
+    let column = squares[row].trailing_zeros();
+    ships.iter().enumerate().any(|(number, ship)| {
+        let others = [&ships[..number], &ships[number + 1..]].concat();
+        [(1, *ship), (*ship, 1)].into_iter().any(|(height, width)| {
+            let (columns, mut rest) = (((1_u16 << width) - 1) << column, squares);
+            let covered = rest.iter_mut().skip(row).take(height as usize).filter(|bits| **bits & columns == columns);
+            covered.map(|bits| *bits &= !columns).count() == height as usize && are_ships(rest, &others)
+        })
+    })
+}
+
 impl Task for Battleship {
     type Parameters = Parameters;
 
@@ -106,8 +123,18 @@ impl Task for Battleship {
         out[0] = f32::from(u8::from(self.is_hit));
     }
 
-    fn is_valid(&self, _: &Parameters) -> bool {
-        (0..=COVERED).contains(&self.hits) && self.steps >= 0
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        let count = |rows: &[u16; ROWS]| rows.iter().map(|row| row.count_ones() as i32).sum::<i32>();
+        let (hits, shots) = (array::from_fn(|row| self.ships[row] & self.shots[row]), count(&self.shots));
+        let is_on_board =
+            |(row, bits): (usize, &u16)| row < parameters.size && bits >> parameters.size == 0 || *bits == 0;
+        [self.ships, self.shots].iter().all(|board| board.iter().enumerate().all(is_on_board))
+            && are_ships(self.ships, &SHIPS)
+            && self.hits == count(&hits)
+            && shots <= self.steps
+            && (shots == 0) == (self.steps == 0)
+            // Every shot but the first at a square misses.
+            && if self.is_hit { self.hits > 0 } else { self.steps == 0 || self.hits < self.steps }
     }
 
     fn expert(id: &str) -> Option<Box<dyn Expert>> {

@@ -39,6 +39,10 @@ const FORCE: f64 = 10.0;
 const SECONDS: f64 = 0.02;
 const MAX_X: f64 = 2.4;
 const MAX_ANGLE: f64 = 12.0 * 2.0 * PI / 360.0;
+/// Bounds of position, velocity, angle and angular velocity until an episode ends, of which the forces on the way from one side to the
+/// other bound the velocities. Once it has ended, the cart rolls on.
+const BOUNDS: [f64; 4] = [MAX_X, 11.0, MAX_ANGLE, 6.0];
+const BOUNDS_AFTER_END: [f64; 4] = [1e18, 1e9, 1e12, 1e3];
 /// Bounds of the observed positions.
 const HIGH: [f32; 2] = [(MAX_X * 2.0) as f32, (MAX_ANGLE * 2.0) as f32];
 
@@ -175,6 +179,24 @@ impl Task for CartPole {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out.copy_from_slice(&self.observation);
+    }
+
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        let Parameters { low, high, .. } = *parameters;
+        let numbers = [self.x, self.velocity, self.angle, self.angular_velocity];
+        let is_first = self.steps == 0;
+        let is_possible = |(number, (bound, bound_after_end)): (f64, (f64, f64))| match self.has_failed {
+            true => !is_first && number.abs() <= bound_after_end,
+            false if is_first => low <= number && number <= low + (high - low),
+            false => number.abs() <= bound,
+        };
+        let positions =
+            if parameters.velocities && !is_first { [numbers[1], numbers[3]] } else { [numbers[0], numbers[2]] };
+        numbers.into_iter().zip(BOUNDS.into_iter().zip(BOUNDS_AFTER_END)).all(is_possible)
+            && match parameters.noise {
+                Some(_) => self.observation.iter().zip(HIGH).all(|(number, high)| number.abs() <= high),
+                None => self.observation == positions.map(|number| number as f32),
+            }
     }
 
     fn expert(id: &str) -> Option<Box<dyn Expert>> {

@@ -38,6 +38,30 @@ impl Concentration {
     fn is_found(&self, card: u8) -> bool {
         self.found >> card & 1 == 1
     }
+
+    fn face(&self, card: u8) -> u8 {
+        self.deck.cards()[usize::from(card)]
+    }
+
+    /// What the observation shows of a card.
+    fn shows(&self, card: u8, face: Face) -> u8 {
+        let is_shown = self.is_found(card) || self.steps > 0 && self.shown.contains(&card);
+        if is_shown { self.face(card) } else { face.count() as u8 }
+    }
+
+    /// Whether the cards that were found are pairs, and those that are shown follow from the last actions.
+    fn are_pairs(&self, face: Face) -> bool {
+        let found = |of| (0..self.view.len() as u8).filter(move |card| self.is_found(*card) && self.face(*card) == of);
+        let ([first, second], is_found) = (self.shown, self.shown.map(|card| self.is_found(card)));
+        let is_pair = first != second && self.face(first) == self.face(second);
+        (0..face.count() as u8).all(|of| found(of).count() % 2 == 0)
+            && match self.first {
+                Some(waiting) => self.steps > 0 && self.shown == [waiting; 2] && !is_found[0],
+                None if self.steps == 0 => self.shown == [0; 2],
+                // The first of two cards that differ was not found before, so it was found with the second.
+                None => first == second || if is_found[0] { is_pair && is_found[1] } else { !is_pair || is_found[1] },
+            }
+    }
 }
 
 impl Task for Concentration {
@@ -120,9 +144,12 @@ impl Task for Concentration {
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
         let cards = parameters.decks * DECK;
-        self.deck.is_valid(parameters.decks, parameters.face)
-            && self.view.len() == cards
-            && self.shown.into_iter().chain(self.first).all(|card| usize::from(card) < cards)
+        self.deck.is_valid(parameters.decks, parameters.face, None)
+            && self.found >> cards == 0
+            && self.found.count_ones() <= self.steps
+            && self.shown.into_iter().all(|card| usize::from(card) < cards)
+            && self.view.iter().copied().eq((0..cards as u8).map(|card| self.shows(card, parameters.face)))
+            && self.are_pairs(parameters.face)
     }
 
     fn expert(_: &str) -> Option<Box<dyn Expert>> {

@@ -37,6 +37,18 @@ impl CountRecall {
         let count = &mut self.counts[usize::from(self.card)];
         *count = count.saturating_add(1);
     }
+
+    /// Whether the counts are those of the cards that have been dealt.
+    fn are_counted(&self) -> bool {
+        let mut counts = [0; KINDS];
+        self.cards.cards()[self.cards.left()..].iter().for_each(|card| counts[usize::from(*card)] += 1);
+        if self.cards.left() == 0 {
+            // The last card is dealt again after the end.
+            let last = usize::from(self.card);
+            counts[last] = self.counts[last].max(counts[last]);
+        }
+        counts == self.counts
+    }
 }
 
 impl Task for CountRecall {
@@ -99,7 +111,10 @@ impl Task for CountRecall {
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
         let Parameters { decks, face, .. } = *parameters;
-        self.cards.is_valid(decks, face) && self.queries.is_valid(decks, face) && usize::from(self.query) < KINDS
+        self.cards.is_valid(decks, face, Some(self.card))
+            && self.queries.is_valid(decks, face, Some(self.query))
+            && self.cards.left() == self.queries.left()
+            && self.are_counted()
     }
 
     fn expert(_: &str) -> Option<Box<dyn Expert>> {

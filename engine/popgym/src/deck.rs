@@ -78,10 +78,12 @@ impl Deck {
         &self.cards
     }
 
-    /// Whether a restored deck has this many decks with such faces.
-    pub fn is_valid(&self, decks: usize, face: Face) -> bool {
+    /// Whether a restored deck consists of this many decks with such faces, and `last` was dealt last.
+    pub fn is_valid(&self, decks: usize, face: Face, last: Option<u8>) -> bool {
+        let count = |face| self.cards.iter().filter(|card| usize::from(**card) == face).count();
         self.cards.len() == decks * DECK
             && self.left <= self.cards.len()
-            && self.cards.iter().all(|card| usize::from(*card) < face.count())
+            && (0..face.count()).all(|of| count(of) == self.cards.len() / face.count())
+            && self.dealt(0) == last
     }
 }

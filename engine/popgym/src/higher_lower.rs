@@ -95,7 +95,7 @@ impl Task for HigherLower {
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
-        self.deck.is_valid(parameters.decks, Face::Card)
+        self.deck.is_valid(parameters.decks, Face::Card, Some(self.card))
     }
 
     fn expert(id: &str) -> Option<Box<dyn Expert>> {

@@ -9,7 +9,7 @@ use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ids, numbered, place};
-use crate::maze::{Maze, Place};
+use crate::maze::{Maze, Place, connected};
 
 const IDS: [[&str; 3]; 2] = [ids!("LabyrinthEscape"), ids!("LabyrinthExplore")];
 /// Cells from the left to the right, between walls.
@@ -79,6 +79,24 @@ impl Labyrinth {
         self.explored[row] |= 1 << column;
         self.left = self.left.saturating_sub(is_new.into());
         is_new
+    }
+
+    /// Whether the agent can have explored these squares of a valid maze, and be where it is.
+    fn is_explored(&self, escapes: bool) -> bool {
+        let mut ways = self.maze.ways();
+        for way in [Some(self.maze.start), escapes.then_some(self.maze.goal)].into_iter().flatten() {
+            ways[way.row] |= 1 << way.column;
+        }
+        let explored = self.explored.iter().map(|row| row.count_ones()).sum();
+        let Place { row, column } = self.position;
+        self.explored.len() == ways.len()
+            && self.explored.iter().zip(&ways).all(|(explored, ways)| explored & !ways == 0)
+            && connected(&self.explored, self.maze.start) == self.explored
+            && row < ways.len()
+            && column < ways.len()
+            && self.explored[row] >> column & 1 == 1
+            && explored <= self.steps.saturating_add(1)
+            && self.left == (self.maze.free() + 1).saturating_sub(explored)
     }
 }
 
@@ -182,11 +200,10 @@ impl Task for Labyrinth {
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
-        let size = 2 * parameters.cells + 1;
-        self.maze.is_valid(size)
-            && self.explored.len() == size
-            && self.position.row < size
-            && self.position.column < size
+        self.maze.is_valid(parameters.cells)
+            && self.reward == 1.0 / f64::from(self.maze.free())
+            && self.is_explored(parameters.escapes)
+            && if self.steps == 0 { self.action == NONE } else { self.action < NONE }
     }
 
     fn expert(_: &str) -> Option<Box<dyn Expert>> {

@@ -117,8 +117,45 @@ impl Maze {
         self.walls.iter().map(|row| row.count_zeros()).sum()
     }
 
-    /// Whether a restored maze has this size.
-    pub fn is_valid(&self, size: usize) -> bool {
-        self.size() == size && self.random.as_ref().is_none_or(|(python, numpy)| python.is_valid() && numpy.is_valid())
+    /// The squares that are no walls, as bits of rows.
+    pub fn ways(&self) -> Vec<u32> {
+        self.walls.iter().map(|row| !row).collect()
+    }
+
+    /// Whether a restored maze has at most `cells` times `cells` cells, exactly one way between any two of them, and start and exit at
+    /// opposite sides.
+    pub fn is_valid(&self, cells: usize) -> bool {
+        let (ways, last, Maze { start, goal, .. }) = (self.ways(), 2 * cells, self);
+        let odd = (0..cells).fold(0, |columns, cell| columns | 2 << (2 * cell));
+        let inside = (1 << last) - 2;
+        let is_open = |(row, ways): (usize, &u32)| ways & !(if row % 2 == 1 { inside } else { odd }) == 0;
+        let open: u32 = ways.iter().skip(1).step_by(2).map(|row| (row & odd).count_ones()).sum();
+        let Some(row) = ways.iter().position(|ways| *ways != 0) else { return false };
+        let first = Place { row, column: ways[row].trailing_zeros() as usize };
+        let are_odd = |a: usize, b: usize| a % 2 == 1 && b % 2 == 1 && a.max(b) < last;
+        let are_ends = |a: usize, b: usize| a.min(b) == 0 && a.max(b) == last;
+        self.size() == last + 1
+            && ways[0] | ways[last] == 0
+            && ways.iter().enumerate().all(is_open)
+            && self.free() + 1 == 2 * open
+            && connected(&ways, first) == ways
+            && (are_ends(start.row, goal.row) && are_odd(start.column, goal.column)
+                || are_ends(start.column, goal.column) && are_odd(start.row, goal.row))
+            && self.random.as_ref().is_some_and(|(python, numpy)| python.is_valid() && numpy.is_valid())
+    }
+}
+
+/// Those of the squares, as bits of rows, to which a way over them leads from one of them.
+pub fn connected(squares: &[u32], from: Place) -> Vec<u32> {
+    let mut reached = vec![0; squares.len()];
+    reached[from.row] = squares[from.row] & 1 << from.column;
+    loop {
+        let row = |row: usize| reached.get(row).copied().unwrap_or(0);
+        let around = |at: usize| row(at) | row(at) << 1 | row(at) >> 1 | row(at.wrapping_sub(1)) | row(at + 1);
+        let next: Vec<u32> = squares.iter().enumerate().map(|(at, squares)| squares & around(at)).collect();
+        if next == reached {
+            return reached;
+        }
+        reached = next;
     }
 }

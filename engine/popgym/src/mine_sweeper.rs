@@ -113,6 +113,22 @@ impl Task for MineSweeper {
         out[0] = self.count.into();
     }
 
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        let squares = parameters.around.len();
+        let board = u64::MAX >> (64 - squares);
+        let is_last = |square: &usize| (self.mines | self.viewed) >> square & 1 == 1;
+        let count = |square: usize| (self.mines & parameters.around[square]).count_ones() as u8;
+        (self.mines | self.viewed) & !board == 0
+            && self.mines & self.viewed == 0
+            && self.mines.count_ones() as usize == parameters.mines
+            && self.viewed.count_ones() <= self.steps
+            && if self.steps == 0 {
+                self.count == 0
+            } else {
+                (0..squares).filter(is_last).map(count).any(|of| of == self.count)
+            }
+    }
+
     fn expert(id: &str) -> Option<Box<dyn Expert>> {
         let parameters = Parameters::new(id);
         Some(Box::new(Solver { counts: vec![None; parameters.around.len()], parameters, last: None }))

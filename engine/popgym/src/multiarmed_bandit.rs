@@ -76,8 +76,12 @@ impl Task for MultiarmedBandit {
         }
     }
 
-    fn is_valid(&self, _: &Parameters) -> bool {
-        self.arms.iter().all(|arm| (0.0..1.0).contains(arm))
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        let (arms, others) = self.arms.split_at(parameters.arms);
+        // Multiples of 2⁻²⁴, as the generator draws them.
+        arms.iter().all(|arm| (0.0..1.0).contains(arm) && (arm * 2_f32.powi(24)).fract() == 0.0)
+            && others.iter().all(|arm| *arm == 0.0)
+            && (self.steps > 0 || !self.has_paid)
     }
 
     fn expert(id: &str) -> Option<Box<dyn Expert>> {

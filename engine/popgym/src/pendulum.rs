@@ -134,6 +134,19 @@ impl Task for Pendulum {
         out.copy_from_slice(&self.observation);
     }
 
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        // The bound of the sum of so many steps and their rounding.
+        let bound = parameters.x_init + (f64::from(self.steps) + 1.0) * MAX_SPEED * SECONDS;
+        let max_speed = if self.steps == 0 { parameters.y_init } else { MAX_SPEED };
+        // Another mathematical library may round differently.
+        let shows = |number: f32, of: f64| parameters.noise.is_some() || (number - of as f32).abs() < 1e-6;
+        self.angle.abs() <= bound
+            && self.velocity.abs() <= max_speed
+            && self.observation.iter().all(|number| number.abs() <= 1.0)
+            && shows(self.observation[0], self.angle.cos())
+            && shows(self.observation[1], self.angle.sin())
+    }
+
     fn expert(id: &str) -> Option<Box<dyn Expert>> {
         let at = place(&IDS.concat(), id);
         Some(Box::new(Swing {

@@ -67,7 +67,8 @@ impl Task for RepeatFirst {
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
-        self.deck.is_valid(parameters.decks, Face::Suit)
+        self.deck.is_valid(parameters.decks, Face::Suit, Some(self.card))
+            && self.deck.cards().last() == Some(&self.first)
     }
 
     fn expert(_: &str) -> Option<Box<dyn Expert>> {

@@ -73,7 +73,7 @@ impl Task for RepeatPrevious {
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
-        self.deck.is_valid(parameters.decks, Face::Suit)
+        self.deck.is_valid(parameters.decks, Face::Suit, Some(self.card))
     }
 
     fn expert(id: &str) -> Option<Box<dyn Expert>> {

@@ -2,11 +2,10 @@
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{Frames, zeroed};
+use endless_gym_core::conformance::seal;
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
-use endless_gym_memory_gym::memory_gym;
 
 use crate::playing;
-use crate::snapshots::sealed;
 
 const ENVS: usize = 2;
 
@@ -15,7 +14,8 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let frames = Some(Frames { stack: input.int_in_range(1..=4)?, ..Frames::default() });
     let seeding = Seeding::Continue { seed: Some(3) };
     let config = PoolConfig { frames, seeding, check_drawing: true, ..PoolConfig::new(spec.id, ENVS) };
-    let pool = || Pool::new(memory_gym(), &config, &Threads::new(1).expect("one thread")).expect("defaults are valid");
+    let pool =
+        || Pool::new(playing::registry(), &config, &Threads::new(1).expect("one thread")).expect("defaults are valid");
     let mut saving = pool();
     let mut blocks = zeroed(saving.layout().blocks());
     saving.reset(ResetRequest::Seed(1), &mut blocks).expect("a pool can be reset");
@@ -30,7 +30,7 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
                 let place = input.choose_index(env.snapshot.len().max(1))?;
                 let byte = input.arbitrary()?;
                 env.snapshot.get_mut(place).into_iter().for_each(|at| *at = byte);
-                sealed(&mut env.snapshot);
+                seal(&mut env.snapshot);
             }
         }
     }

@@ -14,6 +14,7 @@ mod traces;
 mod watchdog;
 
 use arbitrary::Unstructured;
+pub use playing::registry;
 pub use watchdog::BUDGET;
 
 /// A function of arbitrary bytes. An error means that it ended early because the input was too short.

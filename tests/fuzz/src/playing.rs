@@ -1,16 +1,26 @@
 //! Pools that the targets play.
 
+use std::sync::LazyLock;
+
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{Block, zeroed};
-use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::envs::{ActionSpace, EnvSpec};
 use endless_gym_core::pool::{
-    Autoreset, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
+    Autoreset, OptionMap, Pool, PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, Seeding, Threads,
 };
+use endless_gym_core::random::Generator;
 use endless_gym_memory_gym::memory_gym;
+use endless_gym_popgym::register;
+
+/// All ids.
+pub fn registry() -> &'static Registry {
+    static REGISTRY: LazyLock<Registry> = LazyLock::new(|| register(memory_gym().clone()).expect("ids are unique"));
+    &REGISTRY
+}
 
 /// Any of the ids.
 pub(crate) fn spec(input: &mut Unstructured<'_>) -> Result<&'static EnvSpec> {
-    let specs: Vec<_> = memory_gym().specs().collect();
+    let specs: Vec<_> = registry().specs().collect();
     input.choose(&specs).copied()
 }
 
@@ -25,7 +35,7 @@ pub(crate) fn pool(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> 
         check_drawing: true,
         ..PoolConfig::new(spec.id, 1)
     };
-    Pool::new(memory_gym(), &config, &Threads::new(1)?)
+    Pool::new(registry(), &config, &Threads::new(1)?)
 }
 
 /// Resets a pool.
@@ -35,13 +45,23 @@ pub(crate) fn reset(pool: &mut Pool) -> Vec<Block> {
     blocks
 }
 
+/// Draws the ground-truth view, if there is one.
+pub(crate) fn view(pool: &mut Pool) {
+    if pool.spec().frame.is_some() {
+        pool.ground_truth_view(0).expect("the environment exists");
+    }
+}
+
 /// Plays `steps` actions from `input`, or zeros when it is exhausted.
 pub(crate) fn play(pool: &mut Pool, blocks: &mut [Block], input: &mut Unstructured<'_>, steps: usize) -> Result<()> {
-    let branches = pool.spec().action_space.branches().to_vec();
+    let space = pool.spec().action_space.clone();
     for _ in 0..steps {
-        let action = branches.iter().map(|count| input.int_in_range(0..=count - 1)).collect::<Result<Vec<i32>>>()?;
+        let action = match &space {
+            ActionSpace::Box { .. } => space.sample(&mut Generator::from_seed(input.arbitrary()?)),
+            _ => space.branches().iter().map(|count| input.int_in_range(0..=count - 1)).collect::<Result<_>>()?,
+        };
         pool.step(&action, blocks).expect("an action in range is played");
     }
-    pool.ground_truth_view(0).expect("the environment exists");
+    view(pool);
     Ok(())
 }

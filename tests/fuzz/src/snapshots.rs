@@ -2,14 +2,18 @@
 
 use arbitrary::Unstructured;
 use ciborium::Value;
-use endless_gym_core::batch::{Block, zeroed};
+use endless_gym_core::batch::{Batch, Block, zeroed};
+use endless_gym_core::conformance::{check_numbers, seal};
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::pool::{
     Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads,
 };
-use endless_gym_memory_gym::{memory_gym, mortar_mayhem, mystery_path, searing_spotlights};
-use rand::rngs::SmallRng;
-use rand::{RngExt, SeedableRng};
+use endless_gym_core::random::Generator;
+use endless_gym_memory_gym::{mortar_mayhem, mystery_path, searing_spotlights};
+use endless_gym_popgym::{
+    autoencode, battleship, cart_pole, concentration, count_recall, higher_lower, labyrinth, mine_sweeper,
+    multiarmed_bandit, pendulum, repeat_first, repeat_previous,
+};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
@@ -74,7 +78,20 @@ impl Codec {
         match spec.id {
             id if id.contains("MortarMayhem") => Codec::of::<mortar_mayhem::State>(),
             id if id.contains("MysteryPath") => Codec::of::<mystery_path::State>(),
-            _ => Codec::of::<searing_spotlights::State>(),
+            id if id.contains("SearingSpotlights") => Codec::of::<searing_spotlights::State>(),
+            id if id.contains("Autoencode") => Codec::of::<autoencode::Autoencode>(),
+            id if id.contains("Battleship") => Codec::of::<battleship::Battleship>(),
+            id if id.to_lowercase().contains("cartpole") => Codec::of::<cart_pole::CartPole>(),
+            id if id.contains("Concentration") => Codec::of::<concentration::Concentration>(),
+            id if id.contains("CountRecall") => Codec::of::<count_recall::CountRecall>(),
+            id if id.contains("HigherLower") => Codec::of::<higher_lower::HigherLower>(),
+            id if id.contains("Labyrinth") => Codec::of::<labyrinth::Labyrinth>(),
+            id if id.contains("MineSweeper") => Codec::of::<mine_sweeper::MineSweeper>(),
+            id if id.contains("MultiarmedBandit") => Codec::of::<multiarmed_bandit::MultiarmedBandit>(),
+            id if id.contains("Pendulum") => Codec::of::<pendulum::Pendulum>(),
+            id if id.contains("RepeatFirst") => Codec::of::<repeat_first::RepeatFirst>(),
+            id if id.contains("RepeatPrevious") => Codec::of::<repeat_previous::RepeatPrevious>(),
+            id => panic!("the state of {id} is not known"),
         }
     }
 }
@@ -84,7 +101,7 @@ pub struct Game {
     spec: &'static EnvSpec,
     pool: Pool,
     blocks: Vec<Block>,
-    random: SmallRng,
+    random: Generator,
     codec: Codec,
     head: [u8; HEAD],
 }
@@ -104,10 +121,10 @@ impl Game {
             features: true,
             ..PoolConfig::new(spec.id, 1)
         };
-        let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
+        let mut pool = Pool::new(playing::registry(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
-        let random = SmallRng::seed_from_u64(1);
+        let random = Generator::from_seed(1);
         Game { spec, pool, blocks, random, codec: Codec::for_spec(spec), head: [0; HEAD] }
     }
 
@@ -118,8 +135,7 @@ impl Game {
     /// If a step fails.
     pub fn play(&mut self, steps: usize) {
         for _ in 0..steps {
-            let branches = self.spec.action_space.branches();
-            let action: Vec<i32> = branches.iter().map(|n| self.random.random_range(0..*n)).collect();
+            let action = self.spec.action_space.sample(&mut self.random);
             self.pool.step(&action, &mut self.blocks).unwrap();
         }
     }
@@ -130,7 +146,7 @@ impl Game {
     ///
     /// If the format differs from this file's description.
     pub fn content(&mut self) -> Value {
-        let snapshot = self.pool.snapshot(0).unwrap();
+        let snapshot = self.snapshot();
         self.head.copy_from_slice(&snapshot[..HEAD]);
         let content = (self.codec.decode)(&snapshot);
         assert_eq!((self.codec.encode)(&content).unwrap(), &snapshot[HEAD..], "the encoding of {}", self.spec.id);
@@ -148,29 +164,67 @@ impl Game {
 
     /// Restores forged content and plays it unless it is refused.
     pub fn try_to_play(&mut self, content: &Value) -> Outcome {
-        within_budget(content.clone(), || self.outcome(content))
-    }
-
-    fn outcome(&mut self, content: &Value) -> Outcome {
-        match self.restore(content) {
+        within_budget(content.clone(), || match self.restore(content) {
             None => Outcome::NotEncodable,
-            Some(Err(_)) => Outcome::Refused,
-            Some(Ok(())) => {
-                self.play_on();
-                Outcome::Played
-            }
-        }
+            Some(restored) => self.outcome(restored.is_ok()),
+        })
     }
 
-    /// Plays a restored state, and then another episode.
+    /// Restores a snapshot in which the bytes from `place` on are replaced, and plays it unless it is refused.
+    pub fn try_to_play_bytes(&mut self, snapshot: &[u8], place: usize, bytes: &[u8]) -> Outcome {
+        let mut forged = snapshot.to_vec();
+        forged.iter_mut().skip(place).zip(bytes).for_each(|(at, byte)| *at = *byte);
+        seal(&mut forged);
+        within_budget(forged.clone(), || {
+            let restored = self.pool.restore(0, &forged);
+            self.outcome(restored.is_ok())
+        })
+    }
+
+    fn outcome(&mut self, is_restored: bool) -> Outcome {
+        if !is_restored {
+            return Outcome::Refused;
+        }
+        self.play_on();
+        Outcome::Played
+    }
+
+    /// A snapshot.
+    ///
+    /// # Panics
+    ///
+    /// Never: the environment was reset.
+    pub fn snapshot(&self) -> Vec<u8> {
+        self.pool.snapshot(0).unwrap()
+    }
+
+    /// Plays a restored state, which must continue as one that the environment can be in, and then another episode.
     fn play_on(&mut self) {
+        let snapshot = self.snapshot();
+        self.pool.restore(0, &snapshot).unwrap();
+        assert!(self.snapshot() == snapshot, "{}", self.spec.id);
         self.pool.observe(&mut self.blocks).unwrap();
-        self.pool.ground_truth_view(0).unwrap();
-        self.play(40);
-        self.pool.ground_truth_view(0).unwrap();
-        self.pool.snapshot(0).unwrap();
+        playing::view(&mut self.pool);
+        self.check(true);
+        for _ in 0..40 {
+            self.play(1);
+            self.check(false);
+        }
+        playing::view(&mut self.pool);
         self.pool.reset(ResetRequest::All, &mut self.blocks).unwrap();
         self.play(2);
+    }
+
+    fn check(&self, is_first: bool) {
+        let batch = Batch::new(self.pool.layout(), &self.blocks);
+        let reward = batch.reward()[0];
+        if self.spec.frame.is_none() {
+            assert!(reward.abs() <= 1.0, "{}: a reward of {reward}", self.spec.id);
+        } else if is_first || batch.has_ended(0) {
+            // As in the original, an agent may start up to two pixels beyond the bounds of the ground truth.
+            return;
+        }
+        check_numbers(self.spec, &batch).unwrap_or_else(|problem| panic!("{}: {problem}", self.spec.id));
     }
 }
 
@@ -237,17 +291,11 @@ pub fn extremes() -> Vec<Value> {
     let bounds = [1 << 8, 1 << 13, 1 << 15, 1 << 28, 1 << 31, 1 << 32, 1 << 62, 1 << 63, 1 << 64_i128];
     let integers = bounds.into_iter().flat_map(|bound| [bound - 4, bound - 1, bound, -bound]).chain([-1, 0, 1, 2]);
     let in_range = |value: &i128| (i128::from(i64::MIN)..=i128::from(u64::MAX)).contains(value);
-    let floats = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, f64::MAX, f64::MIN, -0.0, f64::MIN_POSITIVE, -1e9, 1e9];
+    let floats =
+        [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, f64::MAX, f64::MIN, -0.0, f64::MIN_POSITIVE, -1e9, 1e9, 1e200];
     let others = [Value::Bool(false), Value::Bool(true), Value::Null, Value::Array(Vec::new())];
     let integers = integers.filter(in_range).map(|value| Value::Integer(value.try_into().unwrap()));
     integers.chain(floats.into_iter().map(Value::Float)).chain(others).collect()
-}
-
-/// Updates the checksum of changed bytes.
-pub(crate) fn sealed(snapshot: &mut [u8]) {
-    if let Some((head, content)) = snapshot.split_at_mut_checked(HEAD) {
-        head[8..].copy_from_slice(&crc32fast::hash(content).to_le_bytes());
-    }
 }
 
 /// Plays a snapshot in which some numbers, or some bytes, are replaced.
@@ -261,15 +309,12 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
     let mut game = Game::new(spec, seeding, Map::new());
     game.play(input.int_in_range(0..=60)?);
     if input.arbitrary()? {
-        let mut snapshot = game.pool.snapshot(0).expect("the environment exists");
+        let mut snapshot = game.snapshot();
         for _ in 0..input.int_in_range(1..=8)? {
             let place = input.choose_index(snapshot.len())?;
             snapshot[place] = input.arbitrary()?;
         }
-        sealed(&mut snapshot);
-        if game.pool.restore(0, &snapshot).is_ok() {
-            game.play_on();
-        }
+        game.try_to_play_bytes(&snapshot, 0, &[]);
         return Ok(());
     }
     let (mut content, extremes) = (game.content(), extremes());

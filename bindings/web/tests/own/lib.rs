@@ -57,6 +57,10 @@ macro_rules! task {
                 Transition { reward: 1.0, terminated: false, truncated: self.steps == STEPS }
             }
 
+            fn is_valid(&self, _: &()) -> bool {
+                self.steps == 0 && self.action.is_empty() || Self::spec().action_space.check(1, &self.action).is_ok()
+            }
+
             $frame_or_features
         }
     };

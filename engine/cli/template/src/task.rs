@@ -101,9 +101,11 @@ impl Task for TMaze {
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
+        // Without auto-reset, steps go on after the end; the limit keeps them from overflowing.
         [LEFT, RIGHT].contains(&self.cue)
             && (0..=parameters.length).contains(&self.position)
-            && (self.position..=parameters.max_steps).contains(&self.steps)
+            && (self.position..=i64::from(u32::MAX)).contains(&self.steps)
+            && (!self.success || self.position == parameters.length)
     }
 }
 

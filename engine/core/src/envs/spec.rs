@@ -78,6 +78,29 @@ impl ObservationSpace {
             ObservationSpace::Tuple(parts) => parts.iter().map(ObservationSpace::width).sum(),
         }
     }
+
+    /// Whether features are in the space.
+    pub fn contains(&self, features: &[f32]) -> bool {
+        let is_choice =
+            |(number, choices): (&f32, &i32)| number.fract() == 0.0 && (0.0..*choices as f32).contains(number);
+        features.len() == self.width()
+            && match self {
+                ObservationSpace::Discrete(choices) => is_choice((&features[0], choices)),
+                ObservationSpace::MultiDiscrete(choices) => features.iter().zip(*choices).all(is_choice),
+                ObservationSpace::Box { low, high } => features
+                    .iter()
+                    .zip(low.iter().zip(*high))
+                    .all(|(number, (low, high))| (*low..=*high).contains(number)),
+                ObservationSpace::Tuple(parts) => {
+                    let mut rest = features;
+                    parts.iter().all(|part| {
+                        let (own, others) = rest.split_at(part.width());
+                        rest = others;
+                        part.contains(own)
+                    })
+                }
+            }
+    }
 }
 
 impl fmt::Display for ObservationSpace {

@@ -59,6 +59,10 @@ use crate::raster::Canvas;
 ///     fn features(&self, _: &(), out: &mut [f32]) {
 ///         out[0] = if self.step == 0 { self.number as f32 } else { 0.0 };
 ///     }
+///
+///     fn is_valid(&self, _: &()) -> bool {
+///         (0..4).contains(&self.number)
+///     }
 /// }
 ///
 /// let registry = Registry::new().with::<Repeat>()?;
@@ -125,10 +129,10 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
         None
     }
 
-    /// Whether the rules can reach a restored state, so that no later call panics. A snapshot may be forged.
-    fn is_valid(&self, _parameters: &Self::Parameters) -> bool {
-        true
-    }
+    /// Whether an environment with these parameters can be in this state, in an episode or after its end. A snapshot may be forged,
+    /// so each number may be anything that its type can be; a state that is accepted is played. Check ranges, lengths, and what
+    /// fields have in common.
+    fn is_valid(&self, parameters: &Self::Parameters) -> bool;
 }
 
 /// A [`Task`] as an [`Environment`]: its scene is its state, and a frame is painted in full whenever the state has changed.

@@ -34,6 +34,7 @@ pub use experts::{Experts, ExpertsError};
 pub use pool::Pool;
 pub use registry::{NoExpert, Registry, RegistryError};
 pub use seeding::Seeding;
+pub(crate) use snapshot::HEAD;
 pub use snapshot::{ResumeError, SNAPSHOT_VERSION, SavedEnv, SnapshotError};
 pub use threads::{StepTimes, Threads};
 

@@ -14,7 +14,8 @@ use crate::envs::{InvalidState, ParameterError};
 use crate::random::Generator;
 
 const MAGIC: [u8; 4] = *b"EGYM";
-const HEAD: usize = 12;
+/// Bytes of the magic, the version and the checksum.
+pub(crate) const HEAD: usize = 12;
 
 /// Version of the snapshot format. It changes with every change to the content.
 pub const SNAPSHOT_VERSION: u32 = 2;

@@ -103,9 +103,11 @@ impl MersenneTwister {
         }
     }
 
-    /// Whether a deserialised state has the right size.
+    /// Whether a deserialised state has the right size, and is not the one that returns only zeros.
     pub fn is_valid(&self) -> bool {
-        self.words.len() == WORDS && self.used <= WORDS
+        self.words.len() == WORDS
+            && (1..=WORDS).contains(&self.used)
+            && (self.words[0] >> 31 == 1 || self.words[1..].iter().any(|word| *word != 0))
     }
 
     fn next_u32(&mut self) -> u32 {

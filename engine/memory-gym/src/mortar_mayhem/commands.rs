@@ -50,11 +50,6 @@ impl Command {
         Command((index % COMMANDS) as u8)
     }
 
-    /// Whether there is such a command. A forged snapshot may hold any number.
-    pub fn is_valid(self) -> bool {
-        self.index() < COMMANDS
-    }
-
     /// The command's number in the original's order, from 0.
     pub fn index(self) -> usize {
         usize::from(self.0)

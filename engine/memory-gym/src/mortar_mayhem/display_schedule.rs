@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::parameters::MAX_DURATION;
+
 /// Shows part of the sequence: each command for `duration` frames, followed by `delay` frames without a command.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DisplaySchedule {
@@ -20,11 +22,16 @@ impl DisplaySchedule {
         DisplaySchedule { first, duration, delay, frame: 0, frames: count * (duration + delay) }
     }
 
-    /// Whether every number is in range. A forged snapshot may hold any numbers.
-    pub fn is_valid(&self) -> bool {
-        const LIMIT: u64 = 1 << 32;
-        [self.first, self.duration, self.delay, self.frame, self.frames].iter().all(|number| (*number as u64) < LIMIT)
-            && (self.frames == 0 || self.duration + self.delay > 0)
+    /// Whether it can be a schedule of a sequence of so many commands. A forged snapshot may hold any numbers.
+    pub fn is_valid(&self, commands: usize) -> bool {
+        let most = MAX_DURATION as usize;
+        let period = self.duration.saturating_add(self.delay);
+        let count = self.frames.checked_div(period).unwrap_or(0);
+        self.duration.max(self.delay) <= most
+            && self.frames == count * period
+            && self.first.checked_add(count).is_some_and(|end| end <= commands)
+            // Each view of the ground truth advances its schedule.
+            && self.frame < 1 << 32
     }
 
     /// Index in the sequence of the first command to show.

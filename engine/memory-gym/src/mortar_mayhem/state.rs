@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::commands::Command;
+use super::commands::{COMMANDS, Command};
 use super::config::Config;
 use super::display_schedule::DisplaySchedule;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_DURATION, Parameters};
@@ -84,7 +84,7 @@ impl State {
         }
     }
 
-    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
+    /// Whether an environment can be in this state. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self, config: &Config) -> bool {
         let displayed_is_valid = match &self.displayed {
             DisplayedCharacter::Earlier { character, scale } => {
@@ -92,20 +92,35 @@ impl State {
             }
             DisplayedCharacter::Initial | DisplayedCharacter::Current => true,
         };
+        let Config { parameters, variant, arena: (left, _, right, _), .. } = config;
+        let (radius, (x, y)) = (config.agent.radius(), self.agent.position);
         self.agent.is_valid()
+            && [x, y].iter().all(|at| (left - radius..=right + radius).contains(at))
+            && self.agent_tile == config.tile_at(self.agent.position)
+            && (variant.locomotion != Locomotion::Grid
+                || config.contains(self.agent_tile)
+                    && (x, y) == config.centre(self.agent_tile)
+                    && self.agent.rotation % 90 == 0)
             && displayed_is_valid
             && config.contains(self.target)
-            && (config.contains(self.agent_tile) || config.variant.locomotion != Locomotion::Grid)
             && !self.commands.is_empty()
-            && self.commands.iter().chain(&self.shown_command).all(|command| command.is_valid())
+            && (variant.endless || parameters.command_count.contains(&(self.commands.len() as i64)))
+            && self
+                .commands
+                .iter()
+                .chain(&self.shown_command)
+                .all(|command| command.index() < parameters.allowed_commands.min(COMMANDS))
             && self.current_command <= self.commands.len()
-            && self.display.is_valid()
-            && self.view_display.is_valid()
+            && (variant.endless || self.total_completed <= self.current_command)
+            && [self.display, self.view_display].iter().all(|display| display.is_valid(self.commands.len()))
             && [self.show_duration, self.show_delay].iter().all(|steps| *steps <= MAX_DURATION as usize)
             && [self.explosion_duration, self.explosion_delay].iter().all(|s| (1..=MAX_DURATION as u32).contains(s))
-            && [self.command_steps, self.verify_steps].iter().all(|steps| *steps < u32::MAX / 2)
             && (0..i64::MAX / 2).contains(&self.steps)
-            && self.total_completed < usize::MAX / 2
+            && self.first_frame == (self.steps == 0)
+            && [self.command_steps, self.verify_steps]
+                .iter()
+                .all(|steps| i64::from(*steps) <= self.steps && *steps < u32::MAX / 2)
+            && self.total_completed as u64 <= self.steps as u64
     }
 
     /// The tile that does not burn, while burning tiles are shown.

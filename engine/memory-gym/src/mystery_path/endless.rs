@@ -5,7 +5,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::config::{Config, TILE};
-use super::parameters::MAX_STAMINA;
+use super::parameters::{MAX_STAMINA, Variant};
 use super::path::Tile;
 use super::route::{Route, SEGMENT};
 use endless_gym_core::random::Generator;
@@ -56,14 +56,17 @@ impl EndlessState {
         self.update_direction(route);
     }
 
-    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
-    pub(super) fn is_valid(&self, route: &Route) -> bool {
-        const FAR: i32 = 1 << 28;
-        self.camera.abs() < f64::from(FAR)
+    /// Whether an environment can be in this state, with the agent `x` pixels to the right of its start. A forged snapshot may hold
+    /// any numbers.
+    pub(super) fn is_valid(&self, route: &Route, config: &Config, x: i32) -> bool {
+        let scrolled = if config.variant == Variant::Endless { f64::from(x) } else { 0.0 };
+        // Sums of fractions are rounded.
+        (self.camera - config.camera - scrolled).abs() < 0.01
             && (0..TILE).contains(&self.background)
             // Negative while an episode continues after its end.
             && (-MAX_STAMINA..=MAX_STAMINA).contains(&self.stamina)
-            && (0..FAR).contains(&self.farthest)
+            && (0..=route.end().0).contains(&self.farthest)
+            && self.falls.iter().all(|(x, _)| *x >= self.farthest)
             && self.at < route.tiles().len()
     }
 

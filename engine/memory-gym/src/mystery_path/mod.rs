@@ -113,7 +113,7 @@ impl Environment for MysteryPath {
     }
 
     fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
-        if !state.is_valid() {
+        if !state.is_valid(&assets.config) {
             return Err(InvalidState);
         }
         self.assets = Arc::clone(assets);

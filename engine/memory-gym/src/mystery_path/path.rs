@@ -31,7 +31,7 @@ pub type Tile = (i32, i32);
 pub struct TileSet(u64);
 
 impl TileSet {
-    const GRID: TileSet = TileSet(0x007f_7f7f_7f7f_7f7f);
+    pub const GRID: TileSet = TileSet(0x007f_7f7f_7f7f_7f7f);
     const BORDER: TileSet = TileSet(0x007f_4141_4141_417f);
 
     /// The set of one tile; empty if the tile is outside the eight columns and seven rows.
@@ -58,6 +58,16 @@ impl TileSet {
             rest &= rest - 1;
             Some(tile(index as u8))
         })
+    }
+
+    /// Number of tiles.
+    pub fn count(self) -> usize {
+        self.0.count_ones() as usize
+    }
+
+    /// Whether all tiles are in the other set.
+    pub fn is_subset(self, other: TileSet) -> bool {
+        self.0 & !other.0 == 0
     }
 
     fn holds(self, index: u8) -> bool {

@@ -41,13 +41,29 @@ pub struct Visit {
 }
 
 impl Route {
-    /// Whether every index and every tile is in range. A forged snapshot may hold any numbers.
+    /// Whether there can be such a route. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
-        let columns = self.segments.len() as i64 * i64::from(SEGMENT);
+        let ends = self.segments.iter().skip(1).map(|segment| segment.first).chain([self.tiles.len()]);
+        let lefts = (0..).step_by(SEGMENT as usize);
         self.segments.len() < 1 << 24
-            && !self.tiles.is_empty()
-            && self.tiles.iter().all(|(x, y)| (0..columns).contains(&i64::from(*x)) && (0..GRID).contains(y))
-            && self.segments.iter().all(|segment| segment.first < self.tiles.len())
+            && self.segments.first().is_some_and(|segment| segment.first == 0)
+            && self.segments.iter().zip(ends).zip(lefts).all(|((segment, end), left)| {
+                let tiles = self.tiles.get(segment.first..end).unwrap_or_default();
+                let mut set = TileSet::default();
+                tiles.iter().for_each(|(x, y)| set.insert((x.wrapping_sub(left), *y)));
+                !tiles.is_empty()
+                    && (set.count(), set) == (tiles.len(), segment.tiles)
+                    && segment.walls.is_subset(TileSet::GRID)
+                    && segment.seen.is_subset(set)
+                    && segment.seen_since_fall.is_subset(segment.seen)
+            })
+            && self.tiles.windows(2).all(|pair| pair[0].0.abs_diff(pair[1].0) + pair[0].1.abs_diff(pair[1].1) == 1)
+    }
+
+    /// Whether a tile is part of it.
+    pub fn contains(&self, (x, y): Tile) -> bool {
+        let segment = usize::try_from(x / SEGMENT).ok().and_then(|number| self.segments.get(number));
+        segment.is_some_and(|segment| segment.tiles.contains((x % SEGMENT, y)))
     }
 
     /// Removes all paths but keeps the allocated memory.

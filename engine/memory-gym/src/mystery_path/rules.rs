@@ -33,7 +33,7 @@ impl State {
     }
 
     /// The agent's start position.
-    fn origin(&self, config: &Config) -> (i32, i32) {
+    pub(super) fn origin(&self, config: &Config) -> (i32, i32) {
         let inset = match config.variant {
             Variant::Grid => TILE / 2,
             // The middle of the tile only at the default scale.

@@ -2,12 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::config::{Config, tile_at};
+use super::config::{Config, TILE, tile_at};
 use super::endless::EndlessState;
 use super::parameters::Variant;
-use super::path::Tile;
+use super::path::{Tile, TileSet};
 use super::route::Route;
 use crate::character::Character;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Progress;
 
 /// Everything that changes during play.
@@ -32,16 +33,29 @@ pub struct State {
 }
 
 impl State {
-    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
-    pub(super) fn is_valid(&self) -> bool {
-        const NEAR: i32 = 1 << 28;
-        self.agent.is_valid()
+    /// Whether an environment can be in this state. A forged snapshot may hold any numbers.
+    pub(super) fn is_valid(&self, config: &Config) -> bool {
+        let (x, y) = self.agent.position;
+        let centre = |(x, y): Tile| (x * TILE + TILE / 2, y * TILE + TILE / 2);
+        let end = |start: i32| (SCREEN as i32).max(start + config.agent.radius());
+        self.route.is_valid()
+            && self.agent.is_valid()
             && self.tile == tile_at(self.agent.position)
-            && self.route.is_valid()
-            && self.endless.is_valid(&self.route)
-            && self.cross.is_none_or(|(x, y)| x.abs_diff(0) < NEAR as u32 && y.abs_diff(0) < NEAR as u32)
-            && [self.fails, self.tiles_visited].iter().all(|count| *count < u32::MAX / 2)
+            && match config.variant {
+                Variant::Free => x.min(y) >= 0 && x <= end(0) && y <= end(0),
+                Variant::Grid => (x, y) == centre(self.tile) && TileSet::GRID.contains(self.tile),
+                // One step off the path, at the most.
+                Variant::Endless => {
+                    x >= 0 && (-(SCREEN as i32)..=2 * SCREEN as i32 + config.agent.radius()).contains(&y)
+                }
+            }
+            && self.endless.is_valid(&self.route, config, x - self.origin(config).0)
+            && (self.steps == 0 || self.success || self.off_path != self.route.contains(self.tile))
+            && self.cross.is_none_or(|cross| self.off_path && cross == self.endless.on_screen(self.agent.position))
             && (0..i64::MAX / 2).contains(&self.steps)
+            && [self.fails, self.tiles_visited]
+                .iter()
+                .all(|count| i64::from(*count) <= self.steps && *count < u32::MAX / 2)
     }
 
     /// Number of falls, and of tiles of the path that the agent was on, except the first one; and the endless id's stamina.

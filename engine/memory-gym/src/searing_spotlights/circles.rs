@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 
 use super::config::BAR_HEIGHT;
+use super::parameters::MAX_SPOT_RADIUS;
 use crate::screen::SCREEN;
 use endless_gym_core::raster::Rect;
 
@@ -57,6 +58,13 @@ impl From<&Rect> for Edges {
 }
 
 impl Circle {
+    /// Whether a spotlight can light it. A forged snapshot may hold any numbers.
+    pub fn is_valid(&self) -> bool {
+        let far = SCREEN as i16 + MAX_SPOT_RADIUS as i16 + 20;
+        [self.x, self.y].iter().all(|at| at.unsigned_abs() < far as u16)
+            && (0..=MAX_SPOT_RADIUS as i16).contains(&self.radius)
+    }
+
     /// Its centre in pixels.
     pub fn centre(&self) -> (i32, i32) {
         (self.x.into(), self.y.into())

@@ -10,9 +10,6 @@ pub const BAR_HEIGHT: usize = 4;
 /// Width in pixels of the health bar, the left half of the bar at the top.
 pub const HEALTH_WIDTH: usize = SCREEN / 2;
 
-/// Limit of all coordinates in pixels.
-pub const MAX_COORDINATE: u32 = 1 << 13;
-
 /// Everything that the rules need in addition to the state.
 #[derive(Clone, Debug)]
 pub struct Config {

@@ -125,7 +125,7 @@ impl Environment for SearingSpotlights {
     }
 
     fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
-        if !state.is_valid() {
+        if !state.is_valid(&assets.config) {
             return Err(InvalidState);
         }
         self.assets = Arc::clone(assets);

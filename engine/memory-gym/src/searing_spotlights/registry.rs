@@ -4,7 +4,7 @@
 //! use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
 
 use super::features::FEATURES;
-use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
+use super::parameters::{MAX_AGENT_SCALE, MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use crate::controls::MOVE;
 use crate::screen::FRAME;
 use endless_gym_core::envs::ActionSpace;
@@ -76,7 +76,7 @@ const COINS_VISIBLE: Parameter = Parameter::bool("coins_visible", false, "Whethe
 const AGENT_SPEED: Parameter =
     Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const AGENT_SCALE: Parameter =
-    Parameter::float("agent_scale", 0.25, 0.0, 4.0, "Size of the agent; 0.25 is a radius of 6 pixels.");
+    Parameter::float("agent_scale", 0.25, 0.0, MAX_AGENT_SCALE, "Size of the agent; 0.25 is a radius of 6 pixels.");
 const AGENT_VISIBLE: Parameter = Parameter::bool("agent_visible", false, "Whether the agent is visible in the dark.");
 const SAMPLE_AGENT_POSITION: Parameter = Parameter::bool(
     "sample_agent_position",

@@ -17,7 +17,7 @@ use endless_gym_core::random::Generator;
 const WALKABLE: Bounds = (0, BAR_HEIGHT as i32, SCREEN as i32, SCREEN as i32);
 
 /// Minimum distance in pixels between the centres of coins and exit and the screen's border.
-const SPAWN_MARGIN: i32 = 7;
+pub(super) const SPAWN_MARGIN: i32 = 7;
 
 /// Minimum distances in pixels from the agent, from coins and exit, and between two coins of the endless id.
 const AGENT_SPACE: i32 = 28;

@@ -5,10 +5,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::circles::Circle;
-use super::config::MAX_COORDINATE;
 use super::parameters::{MAX_SPOT_RADIUS, Parameters};
 use crate::screen::SCREEN;
-use crate::vector::{lerp, rotate};
+use crate::vector::{distance, lerp, rotate};
 use endless_gym_core::random::Generator;
 
 /// A spotlight that moves across the screen along a parabola, from one position off the screen to another.
@@ -41,10 +40,9 @@ impl Spotlight {
         let target = start + 180 + random.integers(-45, 45);
         let bend = target + random.integers(-135, 135);
 
-        let size = SCREEN as f64;
-        let distance = (size * size + size * size).sqrt() / 2.0 + f64::from(radius);
-        let centre = (SCREEN / 2) as f64;
-        let at = |degrees: i64| rotate([distance, 0.0], degrees as f64).map(|coordinate| centre + coordinate);
+        let at = |degrees: i64| {
+            rotate([Self::distance(radius), 0.0], degrees as f64).map(|coordinate| Self::CENTRE + coordinate)
+        };
         let start = at(start);
         Spotlight {
             radius,
@@ -58,14 +56,25 @@ impl Spotlight {
         }
     }
 
-    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
-    pub fn is_valid(&self) -> bool {
-        let near =
-            |position: &[f64; 2]| position.iter().all(|coordinate| coordinate.abs() < f64::from(MAX_COORDINATE) / 4.0);
+    /// Whether there can be such a spotlight. A forged snapshot may hold any numbers.
+    pub fn is_valid(&self, parameters: &Parameters) -> bool {
+        let speeds = [parameters.spot_min_speed, parameters.spot_max_speed];
+        let outside = Self::distance(self.radius);
+        let offset = |position: [f64; 2]| distance(position, [Self::CENTRE; 2]);
         (0..=MAX_SPOT_RADIUS).contains(&self.radius)
-            && [self.location, self.start, self.target, self.bend].iter().all(near)
+            && [self.start, self.target, self.bend].into_iter().all(|end| (offset(end) - outside).abs() < 1e-6)
+            && offset(self.location) < outside + 1e-6
             && (0.0..=1.0).contains(&self.progress)
-            && self.speed >= 0.0
+            && self.done == (self.progress == 1.0)
+            && (speeds[0].min(speeds[1]) - 1e-9..=speeds[0].max(speeds[1]) + 1e-9).contains(&self.speed)
+    }
+
+    const CENTRE: f64 = (SCREEN / 2) as f64;
+
+    /// Distance of both ends from the centre of the screen: half its diagonal, and the radius.
+    fn distance(radius: i32) -> f64 {
+        let size = SCREEN as f64;
+        (size * size + size * size).sqrt() / 2.0 + f64::from(radius)
     }
 
     /// Moves to the position of this step.

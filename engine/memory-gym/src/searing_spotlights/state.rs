@@ -3,10 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::circles::Circle;
-use super::config::{Config, MAX_COORDINATE};
-use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters};
+use super::config::{BAR_HEIGHT, Config};
+use super::parameters::{MAX_AGENT_SCALE, MAX_SPOTLIGHTS, Parameters};
+use super::rules::SPAWN_MARGIN;
 use super::spotlight::Spotlight;
-use crate::character::Character;
+use crate::character::{Character, CharacterSize};
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Progress;
 
@@ -109,27 +110,45 @@ impl State {
         }
     }
 
-    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
-    pub(super) fn is_valid(&self) -> bool {
-        let near = |(x, y): (i32, i32)| x.unsigned_abs() < MAX_COORDINATE && y.unsigned_abs() < MAX_COORDINATE;
-        self.agent.is_valid()
-            && self.former_agent.is_none_or(|agent| agent.is_valid())
+    /// Whether an environment can be in this state. A forged snapshot may hold any numbers.
+    pub(super) fn is_valid(&self, config: &Config) -> bool {
+        let parameters = &config.parameters;
+        // An agent may start a little off the screen, and a large one stays below the bar.
+        let end = |radius: i32| (SCREEN as i32 + 2).max(BAR_HEIGHT as i32 + radius);
+        let is_within = |agent: &Character, end| {
+            agent.is_valid()
+                && agent.position.0.min(agent.position.1) >= 0
+                && agent.position.0.max(agent.position.1) <= end
+        };
+        let margins = SPAWN_MARGIN..=SCREEN as i32 - SPAWN_MARGIN;
+        let collected = if config.variant.endless { 0 } else { self.coins_collected as usize };
+        is_within(&self.agent, end(config.agent.radius()))
+            && self
+                .former_agent
+                .is_none_or(|agent| is_within(&agent, end(CharacterSize::new(MAX_AGENT_SCALE).radius())))
             && self.health.is_finite()
+            && self.health <= parameters.agent_health
             && usize::from(self.red_columns) <= SCREEN
             && self.spotlights.len() <= MAX_SPOTLIGHTS
-            && self.spotlights.iter().all(Spotlight::is_valid)
+            && self.spotlights.iter().all(|spotlight| spotlight.is_valid(parameters))
             && self.lit.len() <= MAX_SPOTLIGHTS
+            && self.lit.iter().all(Circle::is_valid)
+            && parameters.num_coins.contains(&(self.num_coins as i64))
+            && self.coins.len().checked_add(collected) == Some(self.num_coins)
+            && self.exit.is_some() == parameters.use_exit
+            && self.exit.is_none_or(|exit| !exit.open || self.coins.is_empty())
             && self
-                .lit
+                .coins
                 .iter()
-                .all(|circle| near(circle.centre()) && (0..=MAX_SPOT_RADIUS).contains(&circle.radius.into()))
-            && self.coins.len() <= MAX_COINS
-            && self.coins.iter().copied().chain(self.exit.map(|exit| exit.location)).all(near)
+                .copied()
+                .chain(self.exit.map(|exit| exit.location))
+                .all(|(x, y)| margins.contains(&x) && margins.contains(&y))
             && self.last_action.iter().chain(&self.shown_action).all(|branch| (0..3).contains(branch))
-            && self.coins_collected < u32::MAX / 2
-            // `i64::MAX` without a limit.
-            && self.spawns_left >= 0
-            && [self.spawn_timer, self.steps, self.coin_steps].iter().all(|count| (0..i64::MAX / 2).contains(count))
+            && (0..i64::MAX / 2).contains(&self.steps)
+            && self.first_frame == (self.steps == 0)
+            && i64::from(self.coins_collected) <= self.steps.min(i64::from(u32::MAX / 2)).max(collected as i64)
+            && (0..=parameters.num_spawns).contains(&self.spawns_left)
+            && [self.spawn_timer, self.coin_steps].iter().all(|count| (0..=self.steps).contains(count))
     }
 
     /// Whether coins are visible in the dark.
