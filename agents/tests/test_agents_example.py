@@ -33,10 +33,6 @@ def example() -> Any:
     return module
 
 
-def test_it_can_be_read_from_top_to_bottom() -> None:
-    assert len(FILE.read_text().splitlines()) <= 350
-
-
 def test_advantages_do_not_depend_on_the_auto_reset_mode(example: Any) -> None:
     """Next-step auto-reset inserts a step after each end, which has no effect on the others."""
     draws, args = torch.Generator().manual_seed(1), example.Args()

@@ -1,24 +1,30 @@
 //! `endless play`: the local page that plays the environments.
 
+#[cfg(not(debug_assertions))]
 use crate::support::page::{BROWSER, Server, given};
 use crate::support::place::Place;
 use crate::support::process::text;
 
+const EPISODE: [&str; 7] = ["play", "SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]", "--open"];
+
 #[test]
+#[cfg(debug_assertions)]
+fn a_program_without_the_page_says_how_to_play() {
+    let place = Place::new();
+    let output = place.endless(&EPISODE).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let stderr = text(&output.stderr);
+    assert!(stderr.contains("`--terminal`") && stderr.contains("run `cargo xtask play`"), "{stderr}");
+}
+
+/// Only release builds contain the page, once it is built; `cargo xtask test --only packages` runs this.
+#[test]
+#[cfg(not(debug_assertions))]
 fn the_page_opens_at_an_episode() {
     let place = Place::new();
-    let arguments = ["play", "SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]", "--open"];
     let browser = place.script("browser", BROWSER);
-    let mut command = place.endless(&arguments);
+    let mut command = place.endless(&EPISODE);
     command.env("BROWSER", &browser);
-    if endless_gym_page::engine().is_none() {
-        // Only release builds contain the page; `cargo xtask test --only packages` tests them.
-        let output = command.output().unwrap();
-        assert!(!output.status.success());
-        let stderr = text(&output.stderr);
-        assert!(stderr.contains("`--terminal`") && stderr.contains("run `cargo xtask play`"), "{stderr}");
-        return;
-    }
     let mut server = Server::start(command);
     assert_eq!(given(&browser), server.url);
     let link = "/#env=SearingSpotlights-v0&seed=9&num_coins=%5B3%5D";

@@ -427,12 +427,11 @@ fn a_resumed_run_may_have_a_new_target() {
     let folder = Folder::new("target");
     let run = folder.run("run", "--ppo.updates 1");
     try_run(&format!("--resume {} --ppo.updates 2 --target-reward 0.5", run.display())).unwrap();
+    assert_eq!(settings(&format!("--resume={}", run.display())).target_reward, Some(0.5));
 }
 
 #[test]
 fn presets_and_runs_to_resume_replace_defaults() {
-    let paper = settings("MortarMayhem-v0 --preset paper --no-recurrence.embedding").validated();
-    assert!(paper.is_err() || !paper.unwrap().recurrence.residual);
     let paper =
         settings("MortarMayhem-v0 --preset=paper --recurrence.no-embedding --ppo.steps 64").validated().unwrap();
     assert_eq!((paper.recurrence.hidden_size, paper.ppo.steps, paper.ppo.updates), (512, 64, 240_000));

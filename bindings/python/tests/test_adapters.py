@@ -105,7 +105,7 @@ class TestStableBaselines3:
                 assert infos[index]["TimeLimit.truncated"] == bool(truncated[index] and not terminated[index])
                 assert infos[index]["episode"]["r"] == pytest.approx(total[index])
                 assert infos[index]["episode"]["l"] == length[index]
-                assert infos[index]["episode"]["t"] >= 0
+                assert 0 <= infos[index]["episode"]["t"] < 600
                 assert infos[index]["reward"] == pytest.approx(total[index])
                 assert infos[index]["length"] == length[index]
             if previous_infos is not None:

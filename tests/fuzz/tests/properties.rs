@@ -56,37 +56,28 @@ fn check(target: &str, cases: u32) {
         .unwrap_or_else(|error| panic!("{target}: {error}"));
 }
 
-#[test]
-fn every_target_has_a_test() {
-    assert_eq!(TARGETS.map(|(name, _)| name), ["actions", "checkpoints", "layouts", "options", "snapshots", "traces"]);
+/// A test for each target, with so many runs.
+macro_rules! targets {
+    ($($name:ident: $cases:literal,)*) => {
+        $(
+            #[test]
+            fn $name() {
+                check(stringify!($name), $cases);
+            }
+        )*
+
+        #[test]
+        fn every_target_has_a_test() {
+            assert_eq!(TARGETS.map(|(name, _)| name), [$(stringify!($name)),*]);
+        }
+    };
 }
 
-#[test]
-fn actions() {
-    check("actions", 150);
-}
-
-#[test]
-fn checkpoints() {
-    check("checkpoints", 100);
-}
-
-#[test]
-fn layouts() {
-    check("layouts", 2_000);
-}
-
-#[test]
-fn options() {
-    check("options", 150);
-}
-
-#[test]
-fn snapshots() {
-    check("snapshots", 150);
-}
-
-#[test]
-fn traces() {
-    check("traces", 300);
+targets! {
+    actions: 150,
+    checkpoints: 100,
+    layouts: 2_000,
+    options: 150,
+    snapshots: 150,
+    traces: 300,
 }
