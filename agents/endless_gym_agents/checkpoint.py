@@ -218,7 +218,8 @@ def _read_of_rust(file: Path) -> dict[str, Any]:
     with regular.opened(file) as content:
         if (header := int.from_bytes(content.read(8), "little")) > _MAX_HEADER:
             raise ValueError(
-                f"{file} is not a checkpoint: its header must have at most {_MAX_HEADER} bytes, and claims {header}"
+                f"{file} is not a file of safetensors, or has far more tensors than a network: its header claims {header} bytes, "
+                f"at most {_MAX_HEADER} are allowed"
             )
     try:
         with safe_open(file, "pt") as content:

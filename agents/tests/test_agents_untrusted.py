@@ -88,7 +88,7 @@ def test_a_million_empty_tensors_are_refused_at_once(tmp_path: Path) -> None:
     header = json.dumps(tensors).encode()
     file = tmp_path / "many.safetensors"
     file.write_bytes(len(header).to_bytes(8, "little") + header)
-    with pytest.raises(ValueError, match="its header must have at most"):
+    with pytest.raises(ValueError, match="far more tensors than a network"):
         checkpoint.load(file)
 
 

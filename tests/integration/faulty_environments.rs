@@ -186,7 +186,9 @@ fn an_engine_in_a_step_that_never_ends_ends_after_its_killed_trainer_and_leaves_
     set_role(&mut command, "stuck trainer");
     let mut trainer = Process::spawn(command.stdout(Stdio::piped()).stderr(File::create(&errors).unwrap()));
     let mut lines = BufReader::new(trainer.0.stdout.take().unwrap()).lines().map_while(Result::ok);
-    let engine = lines.find_map(|line| Some(line.strip_prefix("engine ")?.to_owned())).expect(&read(&errors));
+    let engine = lines
+        .find_map(|line| Some(line.strip_prefix("engine ")?.to_owned()))
+        .unwrap_or_else(|| panic!("{}", read(&errors)));
     trainer.kill();
     let killed = Instant::now();
     let process = PathBuf::from(format!("/proc/{engine}"));
