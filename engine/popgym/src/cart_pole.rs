@@ -39,8 +39,8 @@ const FORCE: f64 = 10.0;
 const SECONDS: f64 = 0.02;
 const MAX_X: f64 = 2.4;
 const MAX_ANGLE: f64 = 12.0 * 2.0 * PI / 360.0;
-/// Bounds of position, velocity, angle and angular velocity until an episode ends, of which the forces on the way from one side to the
-/// other bound the velocities. Once it has ended, the cart rolls on.
+/// Bounds of position, velocity, angle and angular velocity in an episode: the push cannot accelerate cart and pole any further on the way
+/// from one limit to the other. After the end, they go on.
 const BOUNDS: [f64; 4] = [MAX_X, 11.0, MAX_ANGLE, 6.0];
 const BOUNDS_AFTER_END: [f64; 4] = [1e18, 1e9, 1e12, 1e3];
 /// Bounds of the observed positions.
