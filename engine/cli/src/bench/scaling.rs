@@ -128,8 +128,8 @@ fn show(args: &Args, scaling: &Scaling) -> Result<(), Failure> {
         "last join",
         "work",
         "waiting",
-        "service steps/s",
-        "of in process",
+        "service",
+        "ratio",
     ]);
     for row in rows {
         let part = |part: fn(&Parts) -> f64| row.parts.as_ref().map_or("-".to_owned(), |p| format!("{:.1}", part(p)));
@@ -154,7 +154,7 @@ fn show(args: &Args, scaling: &Scaling) -> Result<(), Failure> {
         ))?;
     }
     print(format_args!(
-        "Microseconds of a step: opening and closing by the calling thread alone; joining, work and waiting for the slowest as means \
+        "In process and through the service in steps/s. Microseconds of a step: opening and closing by the calling thread alone; joining, work and waiting for the slowest as means \
          over the threads. Medians of {} rounds of {} s each.",
         args.rounds, args.seconds
     ))
