@@ -20,6 +20,11 @@ const ENVS_FOR_THREADS: usize = 64;
 /// The number of an environment, and its error.
 pub(super) type OfEnv = (usize, PoolError);
 
+/// Maximum number of threads that step that many environments at the same time.
+pub(super) fn useful_threads(num_envs: usize) -> usize {
+    if num_envs < ENVS_FOR_THREADS { 1 } else { num_envs / ENVS_FOR_THREAD }
+}
+
 /// Consecutive environments, with their drawn scenes and their rows of the batch.
 pub(super) struct EnvRange<'a, E: Environment> {
     /// Number of the first environment.
@@ -41,8 +46,8 @@ impl<E: Environment> EnvRange<'_, E> {
         threads: &Threads,
         work: impl Fn(EnvRange<'_, E>) -> Result<(), OfEnv> + Sync,
     ) -> Result<(), OfEnv> {
-        let count = threads.count().min(num_envs / ENVS_FOR_THREAD);
-        if count < 2 || num_envs < ENVS_FOR_THREADS {
+        let count = threads.count().min(useful_threads(num_envs));
+        if count < 2 {
             return work(self);
         }
         let outcome = Mutex::new(Ok(()));

@@ -81,6 +81,11 @@ impl Pool {
         })
     }
 
+    /// Steps with these threads from now on. Results do not depend on them.
+    pub fn set_threads(&mut self, threads: &Threads) {
+        self.threads.clone_from(threads);
+    }
+
     /// The specification of the environment id.
     pub fn spec(&self) -> &EnvSpec {
         &self.entry.spec

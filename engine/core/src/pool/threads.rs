@@ -11,6 +11,7 @@ mod workers;
 use std::ops::Range;
 use std::time::Duration;
 
+use super::division::useful_threads;
 use super::error::PoolError;
 #[cfg(feature = "threads")]
 use crate::batch::limits::MAX_THREADS;
@@ -50,7 +51,8 @@ impl Threads {
     ///
     /// If there are too many, or if the operating system cannot start them.
     pub fn new(count: usize) -> Result<Self, PoolError> {
-        Self::start(count, false)
+        let count = Self::resolve(count)?;
+        Self::start(count, count, false)
     }
 
     /// Like [`new`](Self::new), for threads that [measure](Self::take_times) where the time of a step goes.
@@ -59,16 +61,14 @@ impl Threads {
     ///
     /// Those of [`new`](Self::new).
     pub fn timed(count: usize) -> Result<Self, PoolError> {
-        Self::start(count, true)
+        let count = Self::resolve(count)?;
+        Self::start(count, count, true)
     }
 
-    fn start(count: usize, timed: bool) -> Result<Self, PoolError> {
-        if count > MAX_THREADS {
-            return Err(PoolError::ThreadCount { given: count });
-        }
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        let count = if count == 0 { cores.min(MAX_THREADS) } else { count };
-        let workers = (count > 1).then(|| workers::Workers::new(count - 1, count <= cores, timed)).transpose();
+    /// Starts `count` of `total` threads.
+    fn start(count: usize, total: usize, timed: bool) -> Result<Self, PoolError> {
+        let may_spin = total <= std::thread::available_parallelism().map_or(1, usize::from);
+        let workers = (count > 1).then(|| workers::Workers::new(count - 1, may_spin, timed)).transpose();
         let workers = workers.map_err(|source| PoolError::Threads { count, source })?;
         Ok(Threads { workers: workers.map(std::sync::Arc::new) })
     }
@@ -77,6 +77,40 @@ impl Threads {
     /// [`timed`](Self::timed).
     pub fn take_times(&self) -> Option<StepTimes> {
         self.workers.as_ref()?.take_times()
+    }
+
+    /// The number of threads for a given `count`.
+    fn resolve(count: usize) -> Result<usize, PoolError> {
+        match count {
+            0 => Ok(std::thread::available_parallelism().map_or(1, usize::from).min(MAX_THREADS)),
+            1..=MAX_THREADS => Ok(count),
+            _ => Err(PoolError::ThreadCount { given: count }),
+        }
+    }
+
+    /// `count` threads as in [`new`](Threads::new), divided among callers that step pools of `num_envs` environments at the same
+    /// time: as many callers as get all threads that such a pool can use, at least 1 and at most `callers`. Each caller is one of
+    /// its threads.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`new`](Threads::new).
+    ///
+    /// ```
+    /// use endless_gym_core::pool::Threads;
+    ///
+    /// let counts = |num_envs, callers| -> Result<Vec<_>, endless_gym_core::pool::PoolError> {
+    ///     Ok(Threads::divided(8, num_envs, callers)?.iter().map(Threads::count).collect())
+    /// };
+    /// assert_eq!(counts(32, 3)?, [2, 3, 3]);
+    /// assert_eq!(counts(64, 3)?, [4, 4]);
+    /// assert_eq!(counts(1024, 3)?, [8]);
+    /// # Ok::<(), endless_gym_core::pool::PoolError>(())
+    /// ```
+    pub fn divided(count: usize, num_envs: usize, callers: usize) -> Result<Vec<Self>, PoolError> {
+        let count = Self::resolve(count)?;
+        let callers = (count / useful_threads(num_envs)).clamp(1, callers.max(1));
+        (0..callers).map(|caller| Self::start((count + caller) / callers, count, false)).collect()
     }
 
     /// Number of threads that step environments at the same time, including the calling one.
