@@ -113,7 +113,7 @@ pub mod service {
         EngineActivity, EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus,
         LastRequest, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed, Observer, ObserverStatus,
         Observers, Pictures, ROOT_VARIABLE, Reconnection, Rejection, ServiceError, ServiceSpecification, Trainer,
-        running_engines, timeout_from_seconds,
+        TrainerGroup, running_engines, timeout_from_seconds,
     };
 }
 

@@ -26,6 +26,8 @@ mod service_episodes;
 mod service_faults;
 mod service_forged;
 mod service_frames;
+mod service_groups;
+mod service_observers;
 mod service_pause;
 mod service_pictures;
 mod service_promise;

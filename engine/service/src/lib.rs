@@ -34,6 +34,7 @@
 //! | --- | --- |
 //! | the engine receives a request | it sends exactly one response of the same group: a batch, a snapshot or a rejection; a rejected request changes no environment |
 //! | the trainer requests a snapshot, a restore, or something about episodes | the response holds a snapshot, a text or nothing instead of a batch; observers skip it, and may miss the batch before it |
+//! | several groups have requests | they are executed at the same time, if the engine has threads for them; each answer is sent when its group has finished |
 //! | a group has a pending answer | the trainer must receive it before its next request to this group; other groups are independent |
 //! | two engines are given the same checkpoint file | the second one fails with [`CheckpointError::InUse`], which names the first one's process |
 //! | a new trainer connects | it must reset all environments of a group before it steps them, or adopt their episodes with a reset of no environment ([`ResetRequest::Each`](endless_gym_core::pool::ResetRequest::Each) with flags of 0), which returns the current batch |
@@ -41,6 +42,7 @@
 //! | a second trainer connects | it is refused, because `act` accepts one publisher |
 //! | a trainer dies | its resources are removed by the engine when idle, or by the next trainer when it connects |
 //! | an engine dies or ends | its trainer and its observers detect it with their liveness checks; a trainer may reconnect to a new engine |
+//! | an observer waits for a batch | it sleeps on a futex in the engine's status file, which counts the batches; the engine wakes one observer, and each one wakes others, so that their number does not slow the engine; a dead one leaves nothing behind |
 //! | an observer is slow | it misses batches: its queue holds one batch, which newer ones overwrite |
 //! | an observer is paused | it has no port and receives nothing; its slot and its memory stay reserved |
 //! | an observer resumes while the trainer pauses | the idle engine sends the last batch of the group again, with the same header; the trainer skips it, since it answers no pending request, and no observer returns a step twice |
@@ -142,6 +144,7 @@ mod client {
     pub(crate) mod requests;
     pub(crate) mod status;
     pub(crate) mod trainer;
+    pub(crate) mod trainer_group;
 }
 
 pub use client::connect::{ConnectConfig, timeout_from_seconds};
@@ -151,6 +154,7 @@ pub use client::pictures::{Drawn, Pictures};
 pub use client::requests::{GroupReconnection, LastRequest, Reconnection};
 pub use client::status::{EngineMonitor, EngineProcesses, EngineStatus, GroupStatus, ObserverStatus};
 pub use client::trainer::Trainer;
+pub use client::trainer_group::TrainerGroup;
 pub use engine::config::{CheckpointConfig, EngineConfig};
 pub use engine::serving::Engine;
 pub use engine::status_writer::EngineSummary;

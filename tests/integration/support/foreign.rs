@@ -270,9 +270,9 @@ impl Drop for Published {
     }
 }
 
-/// Writes a status file: a sequence number, the engine's record and that of one group, and the specification.
+/// Writes a status file: a sequence number, the engine's record and that of one group, their bells, and the specification.
 fn publish(namespace: &Namespace, service: &str, layout_version: u32, text: &[u8]) -> Published {
-    const RECORDS: usize = (32 + 24) * 8;
+    const RECORDS: usize = (32 + 24 + 2 * 8) * 8;
     let mut bytes = vec![0; RECORDS];
     let mut package = [0; 32];
     package[..5].copy_from_slice(b"0.0.9");

@@ -2,6 +2,7 @@
 
 pub mod chromium;
 pub mod foreign;
+pub mod meeting;
 pub mod page;
 pub mod place;
 pub mod player;

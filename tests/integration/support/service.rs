@@ -11,9 +11,10 @@ use crate::faulty_environments;
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{
-    BatchLease, ConnectConfig, Engine, EngineConfig, Namespace, Rejection, ServiceError, Trainer,
+    BatchLease, ConnectConfig, Engine, EngineConfig, Namespace, Observers, Rejection, ServiceError, Trainer,
 };
 
+use super::meeting;
 use super::place::Place;
 use super::process::{Process, TIMEOUT};
 
@@ -112,6 +113,12 @@ pub fn play_role() {
             let mut engine = Engine::new(memory_gym(), &config).unwrap_or_else(|e| panic!("{e}: {e:?}"));
             engine.run(&stop_at_end_of_input()).unwrap();
         }
+        ["meeting", num_envs, groups, threads] => {
+            let (pool, groups) = (meeting::pool(num_envs.parse().unwrap()), groups.parse().unwrap());
+            let config = EngineConfig { groups, ..EngineConfig::new("meeting", pool, threads.parse().unwrap()) };
+            let mut engine = Engine::new(&meeting::registry(), &config).unwrap();
+            engine.run(&stop_at_end_of_input()).unwrap();
+        }
         ["trainer", service] => {
             let mut trainer = connect(service);
             for group in 0..trainer.specification().groups {
@@ -130,6 +137,13 @@ pub fn play_role() {
         }
         ["faulty", ref arguments @ ..] => faulty_environments::program(arguments),
         ["stuck", "trainer"] => faulty_environments::stuck_trainer(),
+        ["observer", service] => {
+            let config = ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(service) };
+            let mut observers = Observers::connect(&config, None).unwrap();
+            loop {
+                observers.next(TIMEOUT).unwrap();
+            }
+        }
         _ => panic!("unknown role {role}"),
     }
 }

@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 
 use endless_gym_core::pool::Threads;
 use iceoryx2::identifiers::UniqueNodeId;
-use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
 use crate::client::connect::{ConnectConfig, connect_to_engine};
@@ -17,6 +16,7 @@ use crate::namespace::{descriptors, memory};
 use crate::protocol::ports::{self, EngineServices, OpenMode, PortError, RequestPublisher, ServiceNames};
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, StatusReader};
+use crate::protocol::wait::Doorbell;
 
 /// Chunks of a request publisher: one that the engine reads, one in its queue, one being written.
 const REQUEST_CHUNKS: usize = 3;
@@ -30,7 +30,7 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 /// A trainer's ports to one run of an engine.
 pub(crate) struct EngineConnection {
     pub to_engine: Notifier<Ipc>,
-    pub to_trainer: Listener<Ipc>,
+    pub to_trainer: Doorbell,
     /// By group.
     pub responses: Vec<Arc<ResponsePort>>,
     /// By group. Dropped after the other ports, since the process that gets them is the next trainer.
@@ -64,7 +64,7 @@ impl EngineConnection {
                 };
                 // A dead trainer's ports are removed one by one, so these may still exist.
                 let (responses, to_engine, to_trainer) = create(&services, specification, others, || None)?;
-                Ok((requests, responses, to_engine, to_trainer))
+                Ok((requests, responses, to_engine, Doorbell::new(to_trainer)))
             })?;
         // A valid specification has at least one group.
         let engine = responses[0].engine();

@@ -107,6 +107,11 @@ impl Response {
         (self.trainer, self.request) == (trainer, request)
     }
 
+    /// The engine's name.
+    pub(crate) fn service(&self) -> &str {
+        &self.lease.specification.service
+    }
+
     /// The batch; `None` if the message is something else.
     pub(crate) fn into_batch(self) -> Option<BatchLease> {
         (self.content == ResponseContent::Batch).then_some(self.lease)

@@ -19,13 +19,13 @@ use crate::namespace::node::NamespaceNode;
 use crate::namespace::{descriptors, memory};
 use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
 use crate::protocol::specification::ServiceSpecification;
-use crate::protocol::status_file::{self, ObserverRecord, StatusFile, StatusReader, now};
+use crate::protocol::status_file::{self, Bells, ObserverRecord, StatusFile, StatusReader, now};
 use crate::protocol::wait::LIVENESS_INTERVAL;
 
 /// The status files of the engine and the observer.
 const STATUS_DESCRIPTORS: usize = 2;
 
-/// How often a waiting observer polls.
+/// How often a waiting observer polls if it cannot map the engine's bells.
 const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
 /// Reads the batches of one group while a trainer steps it.
@@ -56,8 +56,8 @@ pub struct Observer {
     group: usize,
     /// The number of the last batch that was received.
     last_step: Option<u64>,
-    /// The engine's status; `None` if it cannot be read.
-    engine: Option<StatusReader>,
+    /// The engine's status, and what wakes this observer; `None` if they cannot be read.
+    bells: Option<Bells>,
     status: Option<ObserverStatusWriter>,
     specification: Arc<ServiceSpecification>,
     node: Arc<NamespaceNode>,
@@ -98,7 +98,7 @@ impl Observer {
             service,
             group,
             last_step: None,
-            engine: StatusReader::open(&status),
+            bells: Bells::open(&status),
             status: ObserverStatusWriter::create(&node, &specification, group),
             specification: Arc::new(specification),
             node,
@@ -108,6 +108,10 @@ impl Observer {
     /// The engine's specification.
     pub fn specification(&self) -> &ServiceSpecification {
         &self.specification
+    }
+
+    fn engine(&self) -> Option<&StatusReader> {
+        self.bells.as_ref().map(|bells| &bells.status)
     }
 
     pub(crate) fn node(&self) -> &NamespaceNode {
@@ -182,7 +186,7 @@ impl Observer {
     /// Number of batches that the group has returned, which is the newest one's [`BatchLease::step`], from the engine's
     /// status; `None` if that cannot be read. Costs the engine nothing and works while this observer is paused.
     pub fn step(&self) -> Option<u64> {
-        self.engine.as_ref().and_then(|engine| engine.group(self.group)).map(|group| group.step)
+        self.engine().and_then(|engine| engine.group(self.group)).map(|group| group.step)
     }
 
     /// Whether [`newest`](Observer::newest) would return a batch, that is, whether the engine has written one since the
@@ -215,32 +219,45 @@ impl Observer {
     /// [`ServiceError::RootRemoved`] if the namespace's directory was removed, and the errors of
     /// [`newest`](Observer::newest).
     pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
-        let start = Instant::now();
-        let mut last_check = start;
-        loop {
-            let is_over = start.elapsed() >= timeout;
-            let is_due = is_over || last_check.elapsed() >= LIVENESS_INTERVAL;
-            // Check before polling, so that the poll still finds the last batch of an engine that has ended.
-            let alive = if is_due { self.check_alive() } else { Ok(()) };
-            if let Some(lease) = self.newest()? {
-                return Ok(lease);
-            }
-            alive?;
-            if is_over {
-                let activity = status::observed_activity(self.engine.as_ref(), self.group);
-                let service = self.specification.service.clone();
-                return Err(ServiceError::TimedOut { service, waited: timeout, activity });
-            }
-            if is_due {
-                last_check = Instant::now();
-            }
-            std::thread::sleep(POLL_INTERVAL.min(timeout));
-        }
+        next(std::slice::from_mut(self), 0, timeout).map(|(_, lease)| lease)
     }
 }
 
-/// How long to wait for one group before polling the others again.
-const TURN: Duration = Duration::from_millis(5);
+/// The next batch of any of these observers of one engine, and its observer's place. `turn` is the place that is polled first.
+fn next(observers: &mut [Observer], turn: usize, timeout: Duration) -> Result<(usize, BatchLease), ServiceError> {
+    let (start, count) = (Instant::now(), observers.len());
+    let mut last_check = start;
+    loop {
+        let left = timeout.saturating_sub(start.elapsed());
+        let is_due = left.is_zero() || last_check.elapsed() >= LIVENESS_INTERVAL;
+        // Check before polling, so that the poll still finds the last batch of an engine that has ended.
+        let alive = if is_due { observers[0].check_alive() } else { Ok(()) };
+        // One observer waits for its group, several for all groups.
+        let first = &observers[0];
+        let bell = if count == 1 { first.group } else { first.specification.groups };
+        // Read before polling, so that no batch after the poll is missed.
+        let seen = first.bells.as_ref().map(|bells| bells.count(bell));
+        for place in (turn..count).chain(0..turn) {
+            if let Some(lease) = observers[place].newest()? {
+                return Ok((place, lease));
+            }
+        }
+        alive?;
+        let first = &observers[0];
+        if left.is_zero() {
+            let activity = status::observed_activity(first.engine(), first.group);
+            let service = first.specification.service.clone();
+            return Err(ServiceError::TimedOut { service, waited: timeout, activity });
+        }
+        if is_due {
+            last_check = Instant::now();
+        }
+        match (&first.bells, seen) {
+            (Some(bells), Some(seen)) => bells.wait(bell, seen, left.min(LIVENESS_INTERVAL)),
+            _ => std::thread::sleep(left.min(POLL_INTERVAL)),
+        }
+    }
+}
 
 /// Reads the batches of one or all groups of an engine while a trainer steps them, and counts the missed batches.
 ///
@@ -310,31 +327,11 @@ impl Observers {
     ///
     /// As [`Observer::next`].
     pub fn next(&mut self, timeout: Duration) -> Result<Observed, ServiceError> {
-        let (start, count) = (Instant::now(), self.observers.len());
-        loop {
-            for place in (0..count).map(|i| (self.turn + i) % count) {
-                if let Some(lease) = self.observers[place].newest()? {
-                    return Ok(self.observed(place, lease));
-                }
-            }
-            let left = timeout.saturating_sub(start.elapsed());
-            let (place, is_last) = (self.turn, count == 1 || left <= TURN);
-            match self.observers[place].next(if is_last { left } else { TURN }) {
-                Ok(lease) => return Ok(self.observed(place, lease)),
-                Err(ServiceError::TimedOut { .. }) if !is_last => self.turn = (place + 1) % count,
-                Err(ServiceError::TimedOut { service, activity, .. }) => {
-                    return Err(ServiceError::TimedOut { service, waited: timeout, activity });
-                }
-                Err(error) => return Err(error),
-            }
-        }
-    }
-
-    fn observed(&mut self, place: usize, lease: BatchLease) -> Observed {
+        let (place, lease) = next(&mut self.observers, self.turn, timeout)?;
         self.turn = (place + 1) % self.observers.len();
         let before = self.steps[place].replace(lease.step());
         let missed = before.map_or(0, |before| lease.step().saturating_sub(before.saturating_add(1)));
-        Observed { lease, missed }
+        Ok(Observed { lease, missed })
     }
 }
 

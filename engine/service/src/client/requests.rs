@@ -21,66 +21,51 @@ impl Request {
     }
 }
 
-/// By group, the pending request and what became of the last one.
-#[derive(Clone, Debug)]
-pub(crate) struct PendingRequests(Vec<GroupRequests>);
-
+/// The pending request of a group, and what became of the last one.
 #[derive(Clone, Copy, Debug)]
-struct GroupRequests {
-    /// Number and content of the pending request.
+pub(crate) struct PendingRequest {
+    /// Its number and content.
     pending: Option<(u64, Request)>,
     last: LastRequest,
 }
 
-impl PendingRequests {
-    pub(crate) fn new(groups: usize) -> Self {
-        PendingRequests(vec![GroupRequests { pending: None, last: LastRequest::None }; groups])
+impl PendingRequest {
+    pub(crate) const NONE: Self = PendingRequest { pending: None, last: LastRequest::None };
+
+    /// Replaces the pending request.
+    pub(crate) fn insert(&mut self, number: u64, request: Request) {
+        *self = PendingRequest { pending: Some((number, request)), last: LastRequest::Pending };
     }
 
-    /// Number of groups.
-    pub(crate) fn groups(&self) -> usize {
-        self.0.len()
-    }
-
-    /// Replaces the pending request of a group.
-    pub(crate) fn insert(&mut self, group: usize, number: u64, request: Request) {
-        self.0[group] = GroupRequests { pending: Some((number, request)), last: LastRequest::Pending };
-    }
-
-    /// The pending request of a group was answered: it was executed, or rejected.
-    pub(crate) fn answered(&mut self, group: usize, executed: bool) {
+    /// The pending request was answered: it was executed, or rejected.
+    pub(crate) fn answered(&mut self, executed: bool) {
         let last = if executed { LastRequest::Played } else { LastRequest::NotPlayed };
-        self.0[group] = GroupRequests { pending: None, last };
+        *self = PendingRequest { pending: None, last };
     }
 
-    /// Whether that request is pending in a group.
-    pub(crate) fn has(&self, group: usize, request: Request) -> bool {
-        self.0[group].pending.is_some_and(|(_, pending)| pending == request)
+    /// Whether that request is pending.
+    pub(crate) fn has(&self, request: Request) -> bool {
+        self.pending.is_some_and(|(_, pending)| pending == request)
     }
 
-    /// The number of the request that is pending in a group.
-    pub(crate) fn any_number(&self, group: usize) -> Option<u64> {
-        self.0[group].pending.map(|(number, _)| number)
+    /// The number of the pending request.
+    pub(crate) fn any_number(&self) -> Option<u64> {
+        self.pending.map(|(number, _)| number)
     }
 
-    /// The number of the request that is pending in a group, if it returns a batch (`batch`) or does not (`!batch`).
-    pub(crate) fn number(&self, group: usize, batch: bool) -> Option<u64> {
-        self.0[group].pending.filter(|(_, pending)| pending.kind.returns_batch() == batch).map(|(number, _)| number)
+    /// The number of the pending request, if it returns a batch (`batch`) or does not (`!batch`).
+    pub(crate) fn number(&self, batch: bool) -> Option<u64> {
+        self.pending.filter(|(_, pending)| pending.kind.returns_batch() == batch).map(|(number, _)| number)
     }
 
-    /// What became of the last request to a group.
-    pub(crate) fn last(&self, group: usize) -> LastRequest {
-        self.0[group].last
+    /// What became of the last request.
+    pub(crate) fn last(&self) -> LastRequest {
+        self.last
     }
 
-    /// Whether a group has a pending request that returns a batch.
-    pub(crate) fn has_batch(&self, group: usize) -> bool {
-        self.number(group, true).is_some()
-    }
-
-    /// Whether any group has a pending request that returns a batch.
-    pub(crate) fn has_any_batch(&self) -> bool {
-        (0..self.groups()).any(|group| self.has_batch(group))
+    /// Whether a request that returns a batch is pending.
+    pub(crate) fn has_batch(&self) -> bool {
+        self.number(true).is_some()
     }
 }
 

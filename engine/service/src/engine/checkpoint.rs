@@ -7,6 +7,8 @@
 use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
@@ -17,12 +19,13 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
 
 use crate::engine::config::{CheckpointConfig, EngineConfig};
-use crate::engine::group::Group;
+use crate::engine::group::{Group, Groups};
 use crate::engine::status_writer::StatusWriter;
 use crate::error::{CHECKPOINT_VERSION, CheckpointError, PACKAGE_VERSION};
 use crate::namespace::locked_file;
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::now;
+use crate::protocol::wait::lock;
 
 const MAGIC: [u8; 4] = *b"EGYC";
 const PREAMBLE: usize = 12;
@@ -196,12 +199,18 @@ fn directory(path: &Path) -> &Path {
 pub(crate) struct Checkpointer {
     config: CheckpointConfig,
     head: CheckpointHead,
-    last: Instant,
     /// Whether a request was executed since the last checkpoint.
-    changed: bool,
-    writing: Option<JoinHandle<Result<(), CheckpointError>>>,
+    changed: AtomicBool,
+    /// Held while the states of the groups are copied. A thread that uses a group must not wait for it.
+    saving: Mutex<Saving>,
     // Released after the last write.
     _lock: CheckpointLock,
+}
+
+#[derive(Debug)]
+struct Saving {
+    last: Instant,
+    writing: Option<JoinHandle<Result<(), CheckpointError>>>,
 }
 
 impl Checkpointer {
@@ -218,15 +227,14 @@ impl Checkpointer {
         Ok(Checkpointer {
             config: config.clone(),
             head,
-            last: Instant::now(),
-            changed: false,
-            writing: None,
+            changed: AtomicBool::new(false),
+            saving: Mutex::new(Saving { last: Instant::now(), writing: None }),
             _lock: lock,
         })
     }
 
     /// Continues from the file, if the configuration asks for it and the file exists.
-    pub(crate) fn resume(&self, groups: &mut [Group], status: &mut StatusWriter) -> Result<(), CheckpointError> {
+    pub(crate) fn resume(&self, groups: &mut [Group], status: &StatusWriter) -> Result<(), CheckpointError> {
         let path = &self.config.path;
         let Some(saved) = self.config.resume.then(|| read(path, &self.head)).transpose()?.flatten() else {
             return Ok(());
@@ -246,22 +254,23 @@ impl Checkpointer {
     }
 
     /// A request was executed.
-    pub(crate) fn mark_changed(&mut self) {
-        self.changed = true;
+    pub(crate) fn mark_changed(&self) {
+        self.changed.store(true, Ordering::SeqCst);
     }
 
     /// Saves in the background if a checkpoint is due.
-    pub(crate) fn poll(&mut self, groups: &[Group], status: &mut StatusWriter) {
-        if self.writing.as_ref().is_some_and(JoinHandle::is_finished)
-            && let Err(e) = self.finish(status)
+    pub(crate) fn poll(&self, groups: &Groups, status: &StatusWriter) {
+        let mut saving = lock(&self.saving);
+        if saving.writing.as_ref().is_some_and(JoinHandle::is_finished)
+            && let Err(e) = self.finish(&mut saving, status)
         {
             tracing::error!(error = %e, "cannot save a checkpoint");
         }
-        let is_due = self.config.every.is_some_and(|every| self.last.elapsed() >= every);
-        if !is_due || !self.changed || self.writing.is_some() {
+        let is_due = self.config.every.is_some_and(|every| saving.last.elapsed() >= every);
+        if !is_due || saving.writing.is_some() || !self.changed.swap(false, Ordering::SeqCst) {
             return;
         }
-        (self.last, self.changed) = (Instant::now(), false);
+        saving.last = Instant::now();
         let saved = match save(groups, status) {
             Ok(saved) => saved,
             // No group was reset.
@@ -271,42 +280,54 @@ impl Checkpointer {
         let (path, head) = (self.config.path.clone(), self.head.clone());
         let thread = std::thread::Builder::new().name("checkpoint".to_owned());
         match thread.spawn(move || write(&path, &head, saved)) {
-            Ok(writing) => self.writing = Some(writing),
+            Ok(writing) => saving.writing = Some(writing),
             Err(e) => tracing::error!(error = %e, "cannot start a thread to save a checkpoint"),
         }
     }
 
     /// Saves now, and returns when the checkpoint is on disk.
-    pub(crate) fn save(&mut self, groups: &[Group], status: &mut StatusWriter) -> Result<(), CheckpointError> {
-        if let Err(e) = self.finish(status) {
+    /// Returns the saved step of each group. The caller must not use a group.
+    pub(crate) fn save(&self, groups: &Groups, status: &StatusWriter) -> Result<Vec<u64>, CheckpointError> {
+        let mut saving = lock(&self.saving);
+        if let Err(e) = self.finish(&mut saving, status) {
             tracing::warn!(error = %e, "cannot save a checkpoint");
         }
-        let saved = save(groups, status)?;
-        write(&self.config.path, &self.head, saved)?;
-        (self.last, self.changed) = (Instant::now(), false);
-        self.saved(status);
-        Ok(())
+        // First: what other threads execute from now on may be missing.
+        let changed = self.changed.swap(false, Ordering::SeqCst);
+        let saved = save(groups, status).and_then(|saved| {
+            let steps = saved.iter().map(|group| group.step).collect();
+            write(&self.config.path, &self.head, saved).map(|()| steps)
+        });
+        match &saved {
+            Ok(_) => {
+                saving.last = Instant::now();
+                self.saved(status);
+            }
+            Err(_) => drop(self.changed.fetch_or(changed, Ordering::SeqCst)),
+        }
+        saved
     }
 
     /// Saves what has changed since the last checkpoint, when the engine stops.
-    pub(crate) fn stop(&mut self, groups: &[Group], status: &mut StatusWriter) -> Result<(), CheckpointError> {
-        let unfinished = self.finish(status);
-        if self.changed || unfinished.is_err() { self.save(groups, status) } else { Ok(()) }
+    pub(crate) fn stop(&self, groups: &Groups, status: &StatusWriter) -> Result<(), CheckpointError> {
+        let unfinished = self.finish(&mut lock(&self.saving), status);
+        let is_needed = self.changed.load(Ordering::SeqCst) || unfinished.is_err();
+        if is_needed { self.save(groups, status).map(drop) } else { Ok(()) }
     }
 
     /// Waits for the thread that writes.
-    fn finish(&mut self, status: &mut StatusWriter) -> Result<(), CheckpointError> {
-        let Some(writing) = self.writing.take() else { return Ok(()) };
+    fn finish(&self, saving: &mut Saving, status: &StatusWriter) -> Result<(), CheckpointError> {
+        let Some(writing) = saving.writing.take() else { return Ok(()) };
         let failed = |_| CheckpointError::Write { path: self.config.path.clone(), reason: "it panicked".to_owned() };
         let written = writing.join().map_err(failed).and_then(|written| written);
         match written {
             Ok(()) => self.saved(status),
-            Err(_) => self.changed = true,
+            Err(_) => self.mark_changed(),
         }
         written
     }
 
-    fn saved(&self, status: &mut StatusWriter) {
+    fn saved(&self, status: &StatusWriter) {
         tracing::info!(path = %self.config.path.display(), "saved a checkpoint");
         status.update_engine(|engine| (engine.checkpoints, engine.last_checkpoint) = (engine.checkpoints + 1, now()));
     }
@@ -315,19 +336,17 @@ impl Checkpointer {
 impl Drop for Checkpointer {
     fn drop(&mut self) {
         // The end of the process would interrupt the thread.
-        if let Some(writing) = self.writing.take() {
+        if let Some(writing) = lock(&self.saving).writing.take() {
             let _ = writing.join();
         }
     }
 }
 
 /// The states of all groups.
-fn save(groups: &[Group], status: &StatusWriter) -> Result<Vec<SavedGroup>, CheckpointError> {
-    let saved: Result<Vec<_>, _> = groups
-        .iter()
-        .enumerate()
-        .map(|(number, group)| group.save().map(|envs| SavedGroup { step: status.step(number), envs }))
-        .collect();
+fn save(groups: &Groups, status: &StatusWriter) -> Result<Vec<SavedGroup>, CheckpointError> {
+    let save =
+        |number| groups.visit(number, |group| group.save().map(|envs| SavedGroup { step: status.step(number), envs }));
+    let saved: Result<Vec<_>, _> = (0..groups.len()).map(save).collect();
     let saved = saved.map_err(|source| CheckpointError::State { source })?;
     if saved.iter().all(|group| group.envs.is_none()) { Err(CheckpointError::NotReset) } else { Ok(saved) }
 }

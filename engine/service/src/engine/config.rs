@@ -46,7 +46,8 @@ pub struct EngineConfig {
     /// one group while the engine steps another.
     #[serde(default = "default_groups")]
     pub groups: usize,
-    /// Number of threads that step the environments of all groups; 0 for one per core.
+    /// Number of threads that step the environments of all groups; 0 for one per core. As many groups as get all the threads that
+    /// they can use (one for fewer than 64 environments) step at the same time.
     #[serde(default)]
     pub threads: usize,
     /// Batches of a group that a trainer or an observer may hold at a time, 1 to 16. The engine requires shared memory for two

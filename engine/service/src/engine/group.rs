@@ -1,7 +1,12 @@
 //! One group of an engine: its pool, its ports, and how it executes requests.
 
 use endless_gym_core::batch::{ActionLayout, ActionSection, Batch, Block, LAYOUT_VERSION, SNAPSHOT_BYTES};
-use endless_gym_core::pool::{NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError};
+use endless_gym_core::pool::{
+    NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError, Threads,
+};
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+
+use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::{ReceiveError, SendError};
 use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use iceoryx2::sample::Sample;
@@ -13,6 +18,7 @@ use crate::namespace::directory::Ipc;
 use crate::namespace::memory::PrefaultedChunks;
 use crate::protocol::message::{PayloadBlock, RequestHeader, RequestKind, ResponseHeader, write_text};
 use crate::protocol::ports::{self, BlockService, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
+use crate::protocol::wait::lock;
 
 /// A request in shared memory.
 pub(crate) type RequestSample = Sample<Ipc, [PayloadBlock], RequestHeader>;
@@ -40,7 +46,8 @@ struct SentBatch {
 /// One group of an engine.
 pub(crate) struct Group {
     pool: Pool,
-    requests: RequestSubscriber,
+    /// Also used by threads that do not use the group.
+    requests: Arc<RequestSubscriber>,
     responses: ResponsePublisher,
     memory: PrefaultedChunks,
     response_service: BlockService<ResponseHeader>,
@@ -51,6 +58,8 @@ pub(crate) struct Group {
     request: RequestData,
     /// The trainer that last reset all environments.
     trainer: Option<u64>,
+    /// Whether a checkpoint is being saved for a request of this group, which takes no other meanwhile.
+    is_saving: bool,
 }
 
 impl Group {
@@ -72,7 +81,7 @@ impl Group {
         let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
         Ok(Group {
             pool,
-            requests,
+            requests: Arc::new(requests),
             responses,
             memory,
             response_service: service,
@@ -80,7 +89,18 @@ impl Group {
             resumed: Vec::new(),
             request: RequestData::default(),
             trainer: None,
+            is_saving: false,
         })
+    }
+
+    /// Steps with these threads from now on.
+    pub(crate) fn set_threads(&mut self, threads: &Threads) {
+        self.pool.set_threads(threads);
+    }
+
+    /// Takes no requests until this is called with `false`.
+    pub(crate) fn set_saving(&mut self, is_saving: bool) {
+        self.is_saving = is_saving;
     }
 
     /// A chunk for a response, with unspecified content.
@@ -104,8 +124,8 @@ impl Group {
     }
 
     /// Sends the last batch again if an observer has resumed since: while the trainer pauses, it would get no other.
-    /// Processes that have the batch recognise it by its numbers and ignore it.
-    pub(crate) fn repeat_batch(&mut self) {
+    /// Processes that have the batch recognise it by its numbers and ignore it. Returns whether it was sent.
+    pub(crate) fn repeat_batch(&mut self) -> bool {
         let mut resumed = Vec::new();
         self.response_service.dynamic_config().list_subscribers(|subscriber| {
             if subscriber.subscriber_name.as_str() == ports::RESUMED {
@@ -115,10 +135,13 @@ impl Group {
         });
         let has_new = resumed.iter().any(|port| !self.resumed.contains(port));
         self.resumed = resumed;
-        let Some(last) = self.last.filter(|_| has_new) else { return };
+        let Some(last) = self.last.filter(|_| has_new) else { return false };
         let mut batch = match self.loan() {
             Ok(batch) => batch,
-            Err(error) => return tracing::warn!(%error, "cannot send a batch again"),
+            Err(error) => {
+                tracing::warn!(%error, "cannot send a batch again");
+                return false;
+            }
         };
         *batch.user_header_mut() = last.header;
         let payload: &mut [Block] = bytemuck::cast_slice_mut(batch.payload_mut());
@@ -132,9 +155,8 @@ impl Group {
             };
             payload.copy_from_slice(written);
         }
-        if let Err(e) = self.send_batch(batch) {
-            tracing::warn!(error = %e, "cannot deliver a batch again");
-        }
+        let sent = self.send_batch(batch).inspect_err(|e| tracing::warn!(error = %e, "cannot deliver a batch again"));
+        sent.is_ok()
     }
 
     /// An environment's frame in the default format; `None` if there is none.
@@ -143,7 +165,10 @@ impl Group {
     }
 
     /// The next request, if there is one.
-    pub(crate) fn poll(&self) -> Result<Option<RequestSample>, ServiceError> {
+    fn poll(&self) -> Result<Option<RequestSample>, ServiceError> {
+        if self.is_saving {
+            return Ok(None);
+        }
         match self.requests.receive() {
             // The trainer died while it connected.
             Err(ReceiveError::ConnectionFailure(e)) => {
@@ -283,6 +308,82 @@ impl Group {
         self.pool.layout().forget_frames(payload);
         bytemuck::cast_slice_mut(payload)[..snapshot.len()].copy_from_slice(&snapshot);
         Ok(Outcome::Snapshot { bytes: snapshot.len() })
+    }
+}
+
+/// The groups of an engine, each of which one thread at a time uses.
+pub(crate) struct Groups {
+    groups: Vec<(Arc<RequestSubscriber>, Mutex<Group>)>,
+    /// Wakes the engine's threads; `None` if there is only one.
+    waker: Option<Notifier<Ipc>>,
+}
+
+/// A group with the request that a thread has taken.
+pub(crate) struct Taken<'a> {
+    pub number: usize,
+    pub group: MutexGuard<'a, Group>,
+    pub request: RequestSample,
+}
+
+impl Groups {
+    pub(crate) fn new(groups: Vec<Group>, waker: Option<Notifier<Ipc>>) -> Self {
+        let groups = groups.into_iter().map(|group| (Arc::clone(&group.requests), Mutex::new(group)));
+        Groups { groups: groups.collect(), waker }
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.groups.len()
+    }
+
+    pub(crate) fn lock(&self, number: usize) -> MutexGuard<'_, Group> {
+        lock(&self.groups[number].1)
+    }
+
+    /// Uses a group between two requests.
+    pub(crate) fn visit<T>(&self, number: usize, visit: impl FnOnce(&mut Group) -> T) -> T {
+        let seen = visit(&mut self.lock(number));
+        self.wake(number);
+        seen
+    }
+
+    /// A thread that found the group locked does not come back by itself.
+    pub(crate) fn wake(&self, number: usize) {
+        if let Some(waker) = &self.waker {
+            ports::notify(waker, number);
+        }
+    }
+
+    /// Wakes any waiting thread.
+    pub(crate) fn wake_any(&self) {
+        self.wake(self.len());
+    }
+
+    /// Takes the first request to any of these groups that no thread uses.
+    pub(crate) fn take(&self, numbers: impl Iterator<Item = usize>) -> Result<Option<Taken<'_>>, ServiceError> {
+        for number in numbers.filter(|number| self.has_request(*number)) {
+            let Some(group) = self.try_lock(number) else { continue };
+            if let Some(request) = group.poll()? {
+                return Ok(Some(Taken { number, group, request }));
+            }
+            drop(group);
+            self.wake(number);
+        }
+        Ok(None)
+    }
+
+    /// Whether there is a request to a group.
+    pub(crate) fn has_request(&self, number: usize) -> bool {
+        // `take` reports the error of a trainer that died while it connected.
+        self.groups[number].0.has_samples().unwrap_or(true)
+    }
+
+    /// The group, unless another thread uses it.
+    pub(crate) fn try_lock(&self, number: usize) -> Option<MutexGuard<'_, Group>> {
+        match self.groups[number].1.try_lock() {
+            Ok(group) => Some(group),
+            Err(TryLockError::Poisoned(group)) => Some(group.into_inner()),
+            Err(TryLockError::WouldBlock) => None,
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::engine::group::Group;
+use crate::engine::group::Groups;
 use crate::engine::status_writer::StatusWriter;
 use crate::protocol::picture_file::{self, MAX_PICTURE_BYTES, PictureFile, PictureHead, Wanted};
 
@@ -53,7 +53,7 @@ impl PictureDrawer {
     }
 
     /// Draws for each viewer whose next picture is due, if there is another one.
-    pub(crate) fn draw(&mut self, groups: &[Group], status: &StatusWriter) {
+    pub(crate) fn draw(&mut self, groups: &Groups, status: &StatusWriter) {
         for viewer in &mut self.viewers {
             if viewer.last.elapsed() >= INTERVAL {
                 viewer.last = Instant::now();
@@ -65,20 +65,21 @@ impl PictureDrawer {
 
 impl Viewer {
     /// `None` if nothing is drawn.
-    fn draw(&mut self, groups: &[Group], status: &StatusWriter) -> Option<()> {
+    fn draw(&mut self, groups: &Groups, status: &StatusWriter) -> Option<()> {
         let wanted = self.file.wanted().ok()?;
-        let group = groups.get(wanted.group())?;
-        let step = status.step(wanted.group());
-        if self.drawn == Some((step, wanted)) {
+        if wanted.group() >= groups.len() || self.drawn == Some((status.step(wanted.group()), wanted)) {
             return None;
         }
-        let mut frames = Vec::new();
-        for env in wanted.envs()? {
-            frames.extend(group.frame(env)?);
-            if frames.len() > MAX_PICTURE_BYTES {
-                return None;
+        let (step, frames) = groups.visit(wanted.group(), |group| {
+            let mut frames = Vec::new();
+            for env in wanted.envs()? {
+                frames.extend(group.frame(env)?);
+                if frames.len() > MAX_PICTURE_BYTES {
+                    return None;
+                }
             }
-        }
+            Some((status.step(wanted.group()), frames))
+        })?;
         self.sequence = self.sequence.wrapping_add(2);
         let drawn = self.file.draw(self.sequence, &PictureHead { step, wanted }, &frames);
         // Probably, there is no memory.

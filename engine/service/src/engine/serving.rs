@@ -1,17 +1,18 @@
 //! The engine: receives requests, steps the pools, and sends the batches that they write into shared memory.
 
+use std::ops::Range;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::{BatchSection, Block, LAYOUT_VERSION, action_layout};
+use endless_gym_core::batch::{BatchSection, LAYOUT_VERSION, action_layout};
 use endless_gym_core::pool::{Pool, PoolError, Registry, ResetOptions, Threads};
-use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use serde_json::json;
 
 use crate::engine::checkpoint::{CheckpointHead, Checkpointer};
 use crate::engine::config::EngineConfig;
-use crate::engine::group::{Group, Outcome, Rejected, RequestSample};
+use crate::engine::group::{Group, Groups, Outcome, Rejected, Taken};
 use crate::engine::pictures::{self, PictureDrawer};
 use crate::engine::status_writer::{EngineSummary, StatusWriter};
 use crate::error::{CheckpointError, PACKAGE_VERSION, Rejection, ServiceError};
@@ -23,7 +24,7 @@ use crate::protocol::discovery;
 use crate::protocol::message::{RequestKind, ResponseHeader, copied};
 use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
 use crate::protocol::specification::ServiceSpecification;
-use crate::protocol::wait::wait;
+use crate::protocol::wait::{Doorbell, lock};
 
 /// Longest time an idle engine parks, and so the longest it takes to notice its stop flag.
 const IDLE_TIMEOUT: Duration = Duration::from_millis(100);
@@ -90,14 +91,76 @@ pub struct Engine {
     // Dropped first: a process that finds the specification expects all services.
     status: StatusWriter,
     // Ports are dropped before the node.
-    groups: Vec<Group>,
+    groups: Groups,
     to_trainer: Notifier<Ipc>,
-    to_engine: Listener<Ipc>,
+    to_engine: Doorbell,
+    servers: Vec<Server>,
     specification: ServiceSpecification,
     checkpointer: Option<Checkpointer>,
     /// `None` if batches have frames, or the environments have none.
-    pictures: Option<PictureDrawer>,
+    pictures: Option<Mutex<PictureDrawer>>,
     node: NamespaceNode,
+}
+
+/// A thread that executes requests at the same time as the others: those of its own groups, whose memory stays in its cache, and
+/// while it has none, those of the groups of busy threads.
+struct Server {
+    groups: Range<usize>,
+    /// This thread and the workers that help it to step a large group.
+    threads: Threads,
+    /// Whether it is executing a request.
+    is_busy: AtomicBool,
+}
+
+/// What the first server does besides: when it last did so.
+struct Chores {
+    cleaned: Instant,
+    checked: Instant,
+    refreshed: Instant,
+}
+
+impl Chores {
+    fn new() -> Self {
+        let now = Instant::now();
+        Chores { cleaned: now, checked: now, refreshed: now }
+    }
+
+    /// Checks that the engine can still be found, looks for viewers, and refreshes the namespace's files, if that is due.
+    fn check(&mut self, engine: &Engine) -> Result<(), ServiceError> {
+        if self.checked.elapsed() < CHECK_INTERVAL {
+            return Ok(());
+        }
+        engine.node.check_root()?;
+        self.checked = Instant::now();
+        if let Some(pictures) = &engine.pictures {
+            lock(pictures).find_viewers();
+        }
+        if self.refreshed.elapsed() >= REFRESH_INTERVAL {
+            engine.node.refresh_files();
+            self.refreshed = self.checked;
+        }
+        Ok(())
+    }
+
+    /// Removes what dead processes left, if that is due.
+    fn clean(&mut self, engine: &Engine) {
+        if self.cleaned.elapsed() >= CLEANUP_INTERVAL {
+            let removed = engine.node.remove_dead_nodes() as u64;
+            if removed > 0 {
+                engine.status.update_engine(|engine| engine.recoveries += removed);
+            }
+            self.cleaned = Instant::now();
+        }
+    }
+}
+
+/// Sets a flag when it is dropped, also by a panic.
+struct SetOnDrop<'a>(&'a AtomicBool);
+
+impl Drop for SetOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
 }
 
 impl Engine {
@@ -119,11 +182,12 @@ impl Engine {
         descriptors::reserve(descriptors::of_engine(config.groups, config.observers) + pictures::MAX_VIEWERS)?;
         let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
         discovery::refuse_second_engine(&node, &config.service, &node.lock()?)?;
-        let (pools, threads) = (config.pools()?, Threads::new(config.threads)?);
-        let pools = || pools.iter().map(|pool| Pool::new(registry, pool, &threads)).collect::<Result<Vec<_>, _>>();
+        let pools = config.pools()?;
+        let threads = Threads::divided(config.threads, config.pool.num_envs, config.groups)?;
+        let pools = || pools.iter().map(|pool| Pool::new(registry, pool, &threads[0])).collect::<Result<Vec<_>, _>>();
         let mut attempt = 1;
         loop {
-            match Self::start(config, node, pools()?) {
+            match Self::start(config, node, pools()?, &threads) {
                 // Another program removed the engine's files.
                 Err(ServiceError::EngineUnreachable { .. } | ServiceError::EngineRestarted { .. })
                     if attempt < START_ATTEMPTS => {}
@@ -139,7 +203,12 @@ impl Engine {
     }
 
     /// Creates the engine's services and publishes them.
-    fn start(config: &EngineConfig, node: NamespaceNode, pools: Vec<Pool>) -> Result<Self, ServiceError> {
+    fn start(
+        config: &EngineConfig,
+        node: NamespaceNode,
+        pools: Vec<Pool>,
+        threads: &[Threads],
+    ) -> Result<Self, ServiceError> {
         let specification = specify(config, &pools[0])?;
         let head = CheckpointHead::new(config, &specification);
         let checkpointer = config.checkpoint.as_ref().map(|config| Checkpointer::new(config, head)).transpose()?;
@@ -149,8 +218,10 @@ impl Engine {
         let names = ServiceNames::new(&config.service, specification.incarnation);
         let services = EngineServices { node: &node, names, mode: OpenMode::Create };
         let creating = node.creating()?;
-        let to_engine = ports::listener(&services.events("to_engine", config.groups)?);
-        let to_engine = to_engine.map_err(|e| e.unexpected("a listener"))?;
+        let events = services.events("to_engine", config.groups)?;
+        let to_engine = Doorbell::new(ports::listener(&events).map_err(|e| e.unexpected("a listener"))?);
+        let waker = (threads.len() > 1).then(|| ports::notifier(&events)).transpose();
+        let waker = waker.map_err(|e| e.unexpected("a notifier"))?;
         let to_trainer = ports::notifier(&services.events("to_trainer", config.groups)?);
         let to_trainer = to_trainer.map_err(|e| e.unexpected("a notifier"))?;
         let mut groups: Vec<_> = pools
@@ -158,10 +229,17 @@ impl Engine {
             .enumerate()
             .map(|(group, pool)| Group::new(&services, group, pool, limits))
             .collect::<Result<_, _>>()?;
+        let first = |server: usize| server * config.groups / threads.len();
+        let servers = threads.iter().enumerate().map(|(server, threads)| Server {
+            groups: first(server)..first(server + 1),
+            threads: threads.clone(),
+            is_busy: AtomicBool::new(false),
+        });
+        let servers = servers.collect();
         let mut status = StatusWriter::create(node.prefix(), &specification)?;
         drop(creating);
         if let Some(checkpointer) = &checkpointer {
-            checkpointer.resume(&mut groups, &mut status)?;
+            checkpointer.resume(&mut groups, &status)?;
         }
         // Last: a process that finds the specification expects all services.
         let lock = node.lock()?;
@@ -172,8 +250,9 @@ impl Engine {
         let (service, process) = (&*specification.service, specification.engine_pid);
         tracing::info!(service, process, id = &*specification.id, groups = specification.groups, "engine started");
         let draws = specification.frames.is_none() && !specification.environment["frame"].is_null();
-        let pictures = draws.then(|| PictureDrawer::new(node.prefix(), specification.incarnation));
-        Ok(Engine { groups, to_trainer, to_engine, specification, status, checkpointer, pictures, node })
+        let pictures = draws.then(|| Mutex::new(PictureDrawer::new(node.prefix(), specification.incarnation)));
+        let groups = Groups::new(groups, waker);
+        Ok(Engine { groups, to_trainer, to_engine, servers, specification, status, checkpointer, pictures, node })
     }
 
     /// Fails unless a trainer could find the engine and all of its services.
@@ -213,61 +292,27 @@ impl Engine {
     /// [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; earlier failures are
     /// logged and tried again later. A trainer's faults are not errors: its requests are rejected.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
-        let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
-        let (mut last_check, mut last_refresh) = (Instant::now(), Instant::now());
-        let mut next = 0;
-        while !stop.load(Ordering::Relaxed) {
-            if last_check.elapsed() >= CHECK_INTERVAL {
-                self.node.check_root()?;
-                last_check = Instant::now();
-                if let Some(pictures) = &mut self.pictures {
-                    pictures.find_viewers();
-                }
-                if last_refresh.elapsed() >= REFRESH_INTERVAL {
-                    self.node.refresh_files();
-                    last_refresh = last_check;
-                }
-            }
-            let Engine { groups, to_engine, .. } = self;
-            // Round robin, so that no group starves.
-            let request = wait(to_engine, IDLE_TIMEOUT, last_request, || {
-                let (first, last) = groups.split_at(next);
-                let in_turn = last.iter().zip(next..).chain(first.iter().zip(0..));
-                for (group, number) in in_turn {
-                    if let Some(sample) = group.poll()? {
-                        return Ok(Some((number, sample)));
-                    }
-                }
-                Ok(None)
-            })?;
-            let is_idle = request.is_none();
-            match request {
-                Some((group, sample)) => {
-                    next = (group + 1) % self.groups.len();
-                    self.answer(group, sample)?;
-                    last_request = Instant::now();
-                }
-                None if last_cleanup.elapsed() >= CLEANUP_INTERVAL => {
-                    let removed = self.node.remove_dead_nodes() as u64;
-                    if removed > 0 {
-                        self.status.update_engine(|engine| engine.recoveries += removed);
-                    }
-                    last_cleanup = Instant::now();
-                }
-                None => {}
-            }
-            if is_idle {
-                self.groups.iter_mut().for_each(Group::repeat_batch);
-            }
-            if let Some(pictures) = &mut self.pictures {
-                pictures.draw(&self.groups, &self.status);
-            }
-            if let Some(checkpointer) = &mut self.checkpointer {
-                checkpointer.poll(&self.groups, &mut self.status);
-            }
-        }
-        if let Some(checkpointer) = &mut self.checkpointer {
-            checkpointer.stop(&self.groups, &mut self.status)?;
+        let (this, ended) = (&*self, AtomicBool::new(false));
+        let serve = |server| {
+            // A thread that ends, even by a panic, ends the others.
+            let _ended = SetOnDrop(&ended);
+            this.serve(server, &|| stop.load(Ordering::Relaxed) || ended.load(Ordering::Relaxed))
+        };
+        std::thread::scope(|scope| {
+            let others = (1..this.servers.len()).map(|server| {
+                let thread = std::thread::Builder::new().name(format!("endless-server-{server}"));
+                let started = thread.spawn_scoped(scope, move || serve(server));
+                started.inspect_err(|_| ended.store(true, Ordering::Relaxed))
+            });
+            let others = others.collect::<Result<Vec<_>, _>>();
+            let others = others.map_err(|source| PoolError::Threads { count: this.servers.len(), source })?;
+            others.into_iter().fold(serve(0), |served, other| match other.join() {
+                Ok(other) => served.and(other),
+                Err(panic) => std::panic::resume_unwind(panic),
+            })
+        })?;
+        if let Some(checkpointer) = &self.checkpointer {
+            checkpointer.stop(&self.groups, &self.status)?;
         }
         self.remove_ending_trainer();
         let summary = self.status.summary();
@@ -275,8 +320,73 @@ impl Engine {
         Ok(summary)
     }
 
+    /// The loop of a server, until `stop` returns true.
+    fn serve(&self, number: usize, stop: &dyn Fn() -> bool) -> Result<(), ServiceError> {
+        let Server { groups: own, threads, is_busy } = &self.servers[number];
+        let (mut last_request, mut next) = (Instant::now(), own.start);
+        let mut chores = (number == 0).then(Chores::new);
+        while !stop() {
+            if let Some(chores) = &mut chores {
+                chores.check(self)?;
+            }
+            let taken = self.to_engine.wait(own, IDLE_TIMEOUT, last_request, || {
+                // Round robin, so that no group starves.
+                let taken = self.groups.take((next..own.end).chain(own.start..next))?;
+                if taken.is_some() {
+                    return Ok(taken);
+                }
+                let busy = self.servers.iter().filter(|server| server.is_busy.load(Ordering::SeqCst));
+                self.groups.take(busy.flat_map(|server| server.groups.clone()))
+            })?;
+            match taken {
+                Some(Taken { number, mut group, request }) => {
+                    is_busy.store(true, Ordering::SeqCst);
+                    let is_own = own.contains(&number);
+                    if is_own {
+                        next = number + 1;
+                    }
+                    // Another server can take them, now that this one is busy.
+                    if own.len() > 1 && own.clone().any(|group| self.groups.has_request(group)) {
+                        self.groups.wake_any();
+                    }
+                    group.set_threads(threads);
+                    self.answer(Taken { number, group, request })?;
+                    if !is_own {
+                        self.groups.wake(number);
+                    }
+                    is_busy.store(false, Ordering::SeqCst);
+                    last_request = Instant::now();
+                }
+                None => {
+                    if let Some(chores) = &mut chores {
+                        chores.clean(self);
+                    }
+                    for group in own.clone() {
+                        if self.groups.try_lock(group).is_some_and(|mut group| group.repeat_batch()) {
+                            self.status.ring(group);
+                        }
+                    }
+                }
+            }
+            if chores.is_some() {
+                self.look_after_files();
+            }
+        }
+        Ok(())
+    }
+
+    /// Draws for viewers and saves checkpoints when they are due.
+    fn look_after_files(&self) {
+        if let Some(pictures) = &self.pictures {
+            lock(pictures).draw(&self.groups, &self.status);
+        }
+        if let Some(checkpointer) = &self.checkpointer {
+            checkpointer.poll(&self.groups, &self.status);
+        }
+    }
+
     /// Executes a request and sends the response.
-    fn answer(&mut self, number: usize, sample: RequestSample) -> Result<(), ServiceError> {
+    fn answer(&self, Taken { number, mut group, request: sample }: Taken<'_>) -> Result<(), ServiceError> {
         let request = copied(sample.user_header());
         if request.layout_version == LAYOUT_VERSION && request.incarnation != self.specification.incarnation {
             tracing::debug!(group = number, "dropped a request for an earlier incarnation");
@@ -286,30 +396,37 @@ impl Engine {
         if self.status.begin(number, &request) {
             tracing::info!(group = number, process = request.process, "a trainer sends its first request");
         }
-        let group = &mut self.groups[number];
         let read = group.read(&self.specification.action, &request, bytemuck::cast_slice(sample.payload()));
         // Returns the chunk to the trainer before the step.
         drop(sample);
+        let kind = read.as_ref().ok().copied();
+        let mut saved = None;
+        if kind == Some(RequestKind::Checkpoint) {
+            group.set_saving(true);
+            // Saving visits every group, this one, too.
+            drop(group);
+            saved = Some(self.save());
+            group = self.groups.lock(number);
+            group.set_saving(false);
+        }
         let mut batch = group.loan()?;
-        let read_kind = read.as_ref().ok().copied();
-        let outcome =
-            read.and_then(|kind| group.execute(kind, &request, bytemuck::cast_slice_mut(batch.payload_mut())));
-        let outcome = match read_kind {
-            Some(RequestKind::Checkpoint) => {
-                outcome.and_then(|_| self.save(bytemuck::cast_slice_mut(batch.payload_mut())))
-            }
-            _ => outcome,
+        let payload = bytemuck::cast_slice_mut(batch.payload_mut());
+        let outcome = match saved {
+            Some(saved) => saved.map(|steps| {
+                group.forget_frames(payload);
+                bytemuck::cast_slice_mut(payload)[..steps.len()].copy_from_slice(&steps);
+                Outcome::Snapshot { bytes: size_of_val(&*steps) }
+            }),
+            None => read.and_then(|kind| group.execute(kind, &request, payload)),
         };
-        if let (Ok(_), Some(checkpointer)) = (&outcome, &mut self.checkpointer)
-            && !read_kind.is_some_and(RequestKind::changes_nothing)
+        if let (Ok(_), Some(checkpointer)) = (&outcome, &self.checkpointer)
+            && !kind.is_some_and(RequestKind::changes_nothing)
         {
             checkpointer.mark_changed();
         }
         let step = self.status.step(number) + u64::from(matches!(outcome, Ok(Outcome::Batch { .. })));
         let text = match &outcome {
-            Err((_, message)) => {
-                self.groups[number].write_rejection(bytemuck::cast_slice_mut(batch.payload_mut()), message)
-            }
+            Err((_, message)) => group.write_rejection(bytemuck::cast_slice_mut(batch.payload_mut()), message),
             Ok(_) => 0,
         };
         let header = batch.user_header_mut();
@@ -330,7 +447,7 @@ impl Engine {
         }
         // A trainer that dies at this moment must not end the engine.
         let sent = match outcome {
-            Ok(Outcome::Batch { .. }) => self.groups[number].send_batch(batch),
+            Ok(Outcome::Batch { .. }) => group.send_batch(batch),
             _ => batch.send(),
         };
         let receivers = sent.unwrap_or_else(|e| {
@@ -338,24 +455,23 @@ impl Engine {
             0
         });
         ports::notify(&self.to_trainer, number);
+        // After the trainer, which is one of the receivers.
+        if receivers > 1 {
+            self.status.ring(number);
+        }
         if receivers == 0 && matches!(outcome, Ok(Outcome::Batch { .. })) {
             self.status.update_group(number, |group| group.undelivered += 1);
         }
         panic.map_or(Ok(()), Err)
     }
 
-    /// Saves a checkpoint and writes the steps of the groups into the payload of the response.
-    fn save(&mut self, payload: &mut [Block]) -> Result<Outcome, Rejected> {
-        let rejected = |e: CheckpointError| match e {
+    /// Saves a checkpoint, and returns the step of each group.
+    fn save(&self) -> Result<Vec<u64>, Rejected> {
+        let checkpointer = self.checkpointer.as_ref().ok_or(CheckpointError::NoFile);
+        checkpointer.and_then(|checkpointer| checkpointer.save(&self.groups, &self.status)).map_err(|e| match e {
             CheckpointError::NotReset => (Rejection::NotReset, e.to_string()),
             e => (Rejection::Checkpoint, e.to_string()),
-        };
-        let checkpointer = self.checkpointer.as_mut().ok_or_else(|| rejected(CheckpointError::NoFile))?;
-        checkpointer.save(&self.groups, &mut self.status).map_err(rejected)?;
-        let steps = self.steps();
-        self.groups[0].forget_frames(payload);
-        bytemuck::cast_slice_mut(payload)[..steps.len()].copy_from_slice(&steps);
-        Ok(Outcome::Snapshot { bytes: size_of_val(&*steps) })
+        })
     }
 
     /// Removes the resources of a trainer that ends together with the engine: an engine often stops because its trainer

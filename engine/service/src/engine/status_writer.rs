@@ -1,6 +1,7 @@
 //! The status of an engine as it serves requests.
 
 use std::path::PathBuf;
+use std::sync::Mutex;
 
 use bytemuck::Zeroable;
 
@@ -9,14 +10,15 @@ use crate::error::{PACKAGE_VERSION, ServiceError};
 use crate::protocol::message::RequestHeader;
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, EngineHead, EngineRecord, GroupRecord, MAGIC, StatusFile, now, padded};
+use crate::protocol::wait::lock;
 
 /// Keeps the records of an engine and publishes every change, which takes tens of nanoseconds.
 #[derive(Debug)]
 pub(crate) struct StatusWriter {
     file: StatusFile,
     path: PathBuf,
-    engine: EngineRecord,
-    groups: Vec<GroupRecord>,
+    engine: Mutex<EngineRecord>,
+    groups: Vec<Mutex<GroupRecord>>,
 }
 
 impl StatusWriter {
@@ -45,7 +47,8 @@ impl StatusWriter {
         };
         let path = status_file::path(prefix, service, incarnation);
         let file = StatusFile::create(&path, &engine, specification.groups, &text)?;
-        Ok(StatusWriter { file, path, engine, groups: vec![GroupRecord::default(); specification.groups] })
+        let groups = (0..specification.groups).map(|_| Mutex::default()).collect();
+        Ok(StatusWriter { file, path, engine: Mutex::new(engine), groups })
     }
 
     /// Lets other processes find the engine, under its name.
@@ -54,22 +57,24 @@ impl StatusWriter {
     }
 
     /// Changes the engine's record.
-    pub(crate) fn update_engine(&mut self, change: impl FnOnce(&mut EngineRecord)) {
-        change(&mut self.engine);
-        self.file.write_engine(&self.engine);
+    pub(crate) fn update_engine(&self, change: impl FnOnce(&mut EngineRecord)) {
+        let mut record = lock(&self.engine);
+        change(&mut record);
+        self.file.write_engine(&record);
     }
 
     /// Changes a group's record.
-    pub(crate) fn update_group(&mut self, group: usize, change: impl FnOnce(&mut GroupRecord)) {
-        let record = &mut self.groups[group];
-        change(record);
-        self.file.write_group(group, record);
+    pub(crate) fn update_group(&self, group: usize, change: impl FnOnce(&mut GroupRecord)) {
+        let mut record = lock(&self.groups[group]);
+        change(&mut record);
+        self.file.write_group(group, &record);
     }
 
     /// A request was taken. Returns whether it is its trainer's first.
-    pub(crate) fn begin(&mut self, group: usize, request: &RequestHeader) -> bool {
-        let is_new = self.groups[group].trainer != request.trainer;
+    pub(crate) fn begin(&self, group: usize, request: &RequestHeader) -> bool {
+        let mut is_new = false;
         self.update_group(group, |record| {
+            is_new = record.trainer != request.trainer;
             if is_new {
                 (record.trainers, record.answered, record.executed) = (record.trainers + 1, 0, 0);
             }
@@ -82,7 +87,7 @@ impl StatusWriter {
     }
 
     /// The request was executed and is about to be answered: `outcome` is what the response holds, `None` for a rejection.
-    pub(crate) fn end(&mut self, group: usize, step: u64, outcome: Option<&Outcome>) {
+    pub(crate) fn end(&self, group: usize, step: u64, outcome: Option<&Outcome>) {
         self.update_group(group, |record| {
             (record.step, record.answered, record.busy_since) = (step, record.taken, 0);
             match outcome {
@@ -97,22 +102,33 @@ impl StatusWriter {
         });
     }
 
+    /// Wakes the observers that wait for a batch of a group.
+    pub(crate) fn ring(&self, group: usize) {
+        let groups = self.groups.len();
+        self.file.ring(groups, group);
+        // An observer of one group, the only one, waits for that group.
+        if groups > 1 {
+            self.file.ring(groups, groups);
+        }
+    }
+
     /// The number of the current step of a group.
     pub(crate) fn step(&self, group: usize) -> u64 {
-        self.groups[group].step
+        lock(&self.groups[group]).step
     }
 
     /// Totals over the groups.
     pub(crate) fn summary(&self) -> EngineSummary {
-        let sum = |field: fn(&GroupRecord) -> u64| self.groups.iter().map(field).sum();
+        let sum = |field: fn(&GroupRecord) -> u64| self.groups.iter().map(|group| field(&lock(group))).sum();
+        let engine = lock(&self.engine);
         EngineSummary {
             batches: sum(|group| group.batches),
             env_steps: sum(|group| group.env_steps),
             episodes: sum(|group| group.episodes),
             rejected: sum(|group| group.rejected),
             undelivered: sum(|group| group.undelivered),
-            dropped: self.engine.dropped,
-            recoveries: self.engine.recoveries,
+            dropped: engine.dropped,
+            recoveries: engine.recoveries,
         }
     }
 }

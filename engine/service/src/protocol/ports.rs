@@ -133,7 +133,7 @@ impl EngineServices<'_> {
         }
     }
 
-    /// The events of one direction. The id of an event is the number of a group; `groups` is the number of groups.
+    /// The events of one direction. The id of an event is the number of a group, or `groups`, the number of groups, for any.
     pub(crate) fn events(&self, to: &str, groups: usize) -> Result<event::PortFactory<Ipc>, ServiceError> {
         let builder = self
             .node
@@ -141,7 +141,8 @@ impl EngineServices<'_> {
             .event()
             .event_id_max_value(groups)
             .max_listeners(1)
-            .max_notifiers(1)
+            // The other side's; and the engine's, which wakes its own threads.
+            .max_notifiers(2)
             .max_nodes(MAX_NODES);
         match self.mode {
             OpenMode::Create => builder.create().map_err(ServiceError::middleware("cannot create a service")),

@@ -4,6 +4,9 @@
 //! writer cannot harm them. Each record is preceded by a sequence number, which is odd while the record is being
 //! written (a sequence lock).
 //!
+//! Behind the records of an engine are its bells: words that count the batches sent, one for each group and one for all groups.
+//! Observers wait for a change of a bell by a futex. They map the bells only for the system call, and read them by `pread` as well.
+//!
 //! The writer holds an `flock` on the file from before the file gets its name until its process ends. A file without
 //! that lock belongs to a dead process and may be removed. This needs no process ids, which differ between containers.
 //!
@@ -14,14 +17,17 @@ use std::fs::{self, File};
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
-use std::sync::atomic::{AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering, fence};
+use std::time::Duration;
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym_core::batch::LAYOUT_VERSION;
 use endless_gym_core::printable;
 use rustix::fs::{FallocateFlags, FlockOperation, fallocate, flock};
+use rustix::io::Errno;
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
-use rustix::time::{ClockId, clock_gettime};
+use rustix::thread::futex;
+use rustix::time::{ClockId, Timespec, clock_gettime};
 
 use crate::error::ServiceError;
 use crate::namespace::segments::{self, OBSERVER_SUFFIX, STATUS_SUFFIX, open_status};
@@ -34,6 +40,8 @@ const WORD: usize = size_of::<u64>();
 const ENGINE_WORDS: usize = 32;
 const GROUP_WORDS: usize = 24;
 const OBSERVER_WORDS: usize = 8;
+/// Words of a bell: the count, and a futex for [`Bells::wait`].
+const BELL_WORDS: usize = 8;
 const _: () = assert!(size_of::<EngineHead>() < size_of::<EngineRecord>());
 const _: () = assert!(size_of::<EngineRecord>() / WORD < ENGINE_WORDS && size_of::<GroupRecord>() / WORD < GROUP_WORDS);
 const _: () = assert!(size_of::<ObserverRecord>() / WORD < OBSERVER_WORDS);
@@ -70,9 +78,14 @@ fn observer_paths(prefix: &str, incarnation: u64) -> Vec<PathBuf> {
     segments::named(&format!("{prefix}{incarnation:016x}."), OBSERVER_SUFFIX)
 }
 
-/// The number of words of a file with that many groups.
+/// The number of words of the records of an engine with that many groups.
 fn words(groups: usize) -> usize {
     ENGINE_WORDS + groups * GROUP_WORDS
+}
+
+/// The number of words before the bell of a group; the bell of all groups follows those of the groups.
+fn words_before_bell(groups: usize, bell: usize) -> usize {
+    words(groups) + bell * BELL_WORDS
 }
 
 /// The status file of an engine or an observer in this process. Dropping it removes the file.
@@ -101,7 +114,7 @@ impl StatusFile {
         groups: usize,
         specification: &[u8],
     ) -> Result<Self, ServiceError> {
-        Self::with_record(path, words(groups), engine, specification)
+        Self::with_record(path, words_before_bell(groups, groups + 1), engine, specification)
     }
 
     /// Creates the file of an observer.
@@ -162,11 +175,28 @@ impl StatusFile {
         self.write(words(group), record);
     }
 
-    /// Writes a record, which consists of words.
-    fn write(&self, at: usize, record: &impl Pod) {
+    /// Rings a bell of an engine with that many groups. If observers wait for it, wakes one; see [`Bells::wait`].
+    pub(crate) fn ring(&self, groups: usize, bell: usize) {
+        let [count, relay] = bell_words(&self.memory()[words_before_bell(groups, bell)..]);
+        let rung = count.fetch_add(1, Ordering::SeqCst).wrapping_add(1);
+        // The others go to another futex without being woken. If the count has changed, the thread that changed it wakes them.
+        let woken = futex::cmp_requeue(count, futex::Flags::empty(), 1, i32::MAX.cast_unsigned(), relay, rung);
+        if let Err(e) = woken
+            && e != Errno::AGAIN
+        {
+            tracing::debug!(error = %e, "cannot wake the observers");
+        }
+    }
+
+    fn memory(&self) -> &[AtomicU64] {
         // SAFETY: the mapping has that many words, is aligned to a page, and lasts until this value is dropped. All access to it
         // in this process is atomic.
-        let memory = unsafe { std::slice::from_raw_parts(self.start.as_ptr(), self.words) };
+        unsafe { std::slice::from_raw_parts(self.start.as_ptr(), self.words) }
+    }
+
+    /// Writes a record, which consists of words.
+    fn write(&self, at: usize, record: &impl Pod) {
+        let memory = self.memory();
         let sequence = memory[at].load(Ordering::Relaxed);
         memory[at].store(sequence.wrapping_add(1), Ordering::Relaxed);
         fence(Ordering::Release);
@@ -185,6 +215,76 @@ impl Drop for StatusFile {
         }
         // SAFETY: the mapping was made with this address and length, and nothing else refers to it.
         let _ = unsafe { munmap(self.start.as_ptr().cast(), self.words * WORD) };
+    }
+}
+
+/// The two futexes of a bell at the start of `memory`.
+fn bell_words(memory: &[AtomicU64]) -> [&AtomicU32; 2] {
+    // SAFETY: a word has the size and the alignment of two of these, and no other code accesses the words of bells.
+    [0, 1].map(|word| unsafe { &*memory[word].as_ptr().cast::<AtomicU32>() })
+}
+
+/// The bells of an engine in another process.
+#[derive(Debug)]
+pub(crate) struct Bells {
+    pub status: StatusReader,
+    groups: usize,
+    /// The mapping, which only the kernel accesses: if the file was truncated, a futex fails, and reading would raise SIGBUS.
+    start: NonNull<AtomicU64>,
+}
+
+// SAFETY: the mapping belongs to this value alone, and its words are atomic.
+unsafe impl Send for Bells {}
+// SAFETY: as above; `&self` gives access to atomic words.
+unsafe impl Sync for Bells {}
+
+impl Bells {
+    /// The bells in an engine's file; `None` if they cannot be mapped.
+    pub(crate) fn open(path: &Path) -> Option<Self> {
+        let status = StatusReader::open(path)?;
+        let groups = status.engine()?.groups as usize;
+        // SAFETY: a new mapping at an address that the system chooses.
+        let start = unsafe {
+            mmap(std::ptr::null_mut(), Self::bytes(groups), ProtFlags::READ, MapFlags::SHARED, &status.file, 0).ok()?
+        };
+        Some(Bells { status, groups, start: NonNull::new(start.cast())? })
+    }
+
+    fn bytes(groups: usize) -> usize {
+        words_before_bell(groups, groups + 1) * WORD
+    }
+
+    /// How often the bell of a group, or of all groups (the number of groups), has rung.
+    pub(crate) fn count(&self, bell: usize) -> u32 {
+        let mut count = [0; size_of::<u32>()];
+        let offset = (words_before_bell(self.groups, bell) * WORD) as u64;
+        let _ = self.status.file.read_exact_at(&mut count, offset);
+        u32::from_ne_bytes(count)
+    }
+
+    /// Waits until the count differs from `seen`, up to `timeout`. May return earlier.
+    ///
+    /// The engine wakes one observer of those that wait, and each one that was woken wakes two others, so that the number of
+    /// observers does not slow the engine. If one dies in between, the others are woken by the next batch or the timeout.
+    pub(crate) fn wait(&self, bell: usize, seen: u32, timeout: Duration) {
+        // SAFETY: the mapping has this many words and lasts until this value is dropped. Nothing is read or written through the
+        // slice in this process.
+        let memory = unsafe { std::slice::from_raw_parts(self.start.as_ptr(), Self::bytes(self.groups) / WORD) };
+        let [count, relay] = bell_words(&memory[words_before_bell(self.groups, bell)..]);
+        let time = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
+        match futex::wait(count, futex::Flags::empty(), seen, Some(&time)) {
+            Ok(()) => drop(futex::wake(relay, futex::Flags::empty(), 2)),
+            Err(Errno::AGAIN | Errno::INTR | Errno::TIMEDOUT) => {}
+            // The file was truncated.
+            Err(_) => std::thread::sleep(timeout.min(Duration::from_millis(1))),
+        }
+    }
+}
+
+impl Drop for Bells {
+    fn drop(&mut self) {
+        // SAFETY: the mapping was made with this address and length, and nothing else refers to it.
+        let _ = unsafe { munmap(self.start.as_ptr().cast(), Self::bytes(self.groups)) };
     }
 }
 
@@ -215,7 +315,8 @@ impl StatusReader {
     /// The text of an engine's specification; `None` if the file is too short.
     pub(crate) fn specification(&self) -> Option<Vec<u8>> {
         let engine = self.engine()?;
-        let offset = (words(engine.groups as usize) * WORD) as u64;
+        let groups = engine.groups as usize;
+        let offset = (words_before_bell(groups, groups + 1) * WORD) as u64;
         let length = engine.head.specification_bytes;
         if self.file.metadata().ok()?.len() < offset.checked_add(length)? {
             return None;
@@ -427,6 +528,41 @@ mod tests {
         drop(file);
         assert!(!path.exists() && !reader.is_alive());
         assert_eq!(reader.group(1), Some(group), "the last status remains readable");
+    }
+
+    /// One thread more than the engine wakes at once; a bell that rings between two waits is not missed.
+    #[test]
+    fn every_waiting_thread_hears_its_bell() {
+        let path = place("bell");
+        let file = published(&path, 2);
+        let long = Duration::from_secs(30);
+        std::thread::scope(|scope| {
+            for (thread, bell) in [0, 0, 0, 0, 0, 1, 2, 2].into_iter().enumerate() {
+                let bells = Bells::open(&path).unwrap();
+                scope.spawn(move || {
+                    let (mut seen, mut waits) = (0, 0);
+                    while seen < 300 {
+                        bells.wait(bell, seen, long);
+                        (seen, waits) = (bells.count(bell), waits + 1);
+                    }
+                    assert!(waits <= 600, "thread {thread} waited {waits} times");
+                });
+            }
+            for round in 0..300 {
+                (0..=2).for_each(|bell| file.ring(2, bell));
+                if round % 3 == 0 {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+            }
+        });
+        let bells = Bells::open(&path).unwrap();
+        assert_eq!([0, 1, 2].map(|bell| bells.count(bell)), [300; 3]);
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o600)).unwrap();
+        File::options().write(true).open(&path).unwrap().set_len(0).unwrap();
+        // Not a SIGBUS.
+        bells.wait(1, 300, Duration::from_millis(20));
+        assert_eq!(bells.count(1), 0);
+        drop(file);
     }
 
     #[test]

@@ -1,0 +1,183 @@
+//! Observers that wait: they sleep until a batch comes, and cannot hold up the engine or each other.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
+use std::time::{Duration, Instant};
+
+use endless_gym::memory_gym;
+use endless_gym::pool::PoolConfig;
+use endless_gym::service::{ConnectConfig, Engine, EngineConfig, EngineStatus, Observer, Observers, Trainer};
+
+use crate::support::place::Place;
+use crate::support::process::{TIMEOUT, wait_until};
+use crate::support::service::{ID, play, reset, step};
+
+/// How often this thread has gone to sleep.
+fn sleeps() -> u64 {
+    let status = std::fs::read_to_string("/proc/thread-self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:")).unwrap();
+    line.trim().parse().unwrap()
+}
+
+#[test]
+fn a_waiting_observer_sleeps_until_a_batch_of_its_group() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 2);
+    let mut trainer = place.trainer("gym").unwrap();
+    (0..2).for_each(|group| drop(reset(&mut trainer, group)));
+    let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
+    let (seen, sleeps) = std::thread::scope(|scope| {
+        let waiting = scope.spawn(|| {
+            let before = sleeps();
+            (observer.next(TIMEOUT).unwrap().step(), sleeps() - before)
+        });
+        // The other group must not wake it. Polls every millisecond would be more than these, too.
+        let start = Instant::now();
+        let mut steps = 0;
+        while steps < 300 || start.elapsed() < Duration::from_secs(1) {
+            step(&mut trainer, 1);
+            steps += 1;
+        }
+        assert!(!waiting.is_finished());
+        step(&mut trainer, 0);
+        waiting.join().unwrap()
+    });
+    assert_eq!(seen, 2);
+    assert!(sleeps < 100, "{sleeps} sleeps");
+}
+
+#[test]
+fn a_batch_wakes_an_observer_at_once() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 2);
+    let mut trainer = place.trainer("gym").unwrap();
+    (0..2).for_each(|group| drop(reset(&mut trainer, group)));
+    for all in [false, true] {
+        let group = (!all).then_some(1);
+        let mut observers = Observers::connect(&place.connect_config("gym"), group).unwrap();
+        let (to_trainer, wanted) = channel();
+        let fastest = std::thread::scope(|scope| {
+            let trainer = &mut trainer;
+            let stepping = scope.spawn(move || {
+                wanted
+                    .into_iter()
+                    .map(|group| {
+                        // The observer waits by now.
+                        std::thread::sleep(Duration::from_micros(500));
+                        let start = Instant::now();
+                        (step(trainer, group).step(), start)
+                    })
+                    .collect::<Vec<_>>()
+            });
+            let mut seen = Vec::new();
+            for round in 0..100 {
+                let group = if all { round % 2 } else { 1 };
+                to_trainer.send(group).unwrap();
+                let observed = observers.next(TIMEOUT).unwrap();
+                assert_eq!((observed.lease.group(), observed.missed), (group, 0));
+                seen.push((observed.lease.step(), Instant::now()));
+            }
+            drop(to_trainer);
+            let sent = stepping.join().unwrap();
+            sent.iter()
+                .zip(seen)
+                .map(|(sent, seen)| {
+                    assert_eq!(sent.0, seen.0);
+                    seen.1 - sent.1
+                })
+                .min()
+                .unwrap()
+        });
+        // Polls of a millisecond find a batch that comes half a millisecond after the last poll later than this.
+        assert!(fastest < Duration::from_micros(400), "{fastest:?}");
+    }
+}
+
+/// Observers die and stop while they wait and while they wake others.
+#[test]
+fn dead_and_stopped_observers_hold_up_nobody() {
+    let place = Place::new();
+    let config = EngineConfig { observers: 16, ..place.engine_config("gym", 2, 2) };
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let mut engine = Engine::new(memory_gym(), &config).unwrap();
+        let (stop, place) = (&stop, &place);
+        let running = scope.spawn(move || engine.run(stop).unwrap());
+        let mut others: Vec<_> = (0..6).map(|_| place.role("observer gym")).collect();
+        wait_until("six observers", || {
+            let status = EngineStatus::of(place.namespace(), "gym");
+            status.is_some_and(|status| status.groups.iter().all(|group| group.observers.len() == 6))
+        });
+        let mut trainer = place.trainer("gym").unwrap();
+        let mut observers = Observers::connect(&place.connect_config("gym"), None).unwrap();
+        let seen = scope.spawn(move || {
+            let mut seen = 0;
+            while observers.next(TIMEOUT).unwrap().lease.step() < 1501 {
+                seen += 1;
+            }
+            seen
+        });
+        others[0].stop();
+        for number in 1..4 {
+            (0..2).for_each(|group| play(&mut trainer, group, 100));
+            others[number].kill();
+        }
+        while !seen.is_finished() {
+            step(&mut trainer, 0);
+        }
+        assert!(seen.join().unwrap() > 0);
+        drop(others);
+        stop.store(true, Ordering::Relaxed);
+        assert!(running.join().unwrap().batches > 1500);
+    });
+}
+
+/// The trainer's speed beside observers that take every batch they can, in turn with that without observers.
+///
+/// ```console
+/// cargo test --release --test integration measure_the_price_of_observers -- --ignored --nocapture
+/// ```
+#[test]
+#[ignore = "measures"]
+fn measure_the_price_of_observers() {
+    const ROUNDS: usize = 7;
+    let place = Place::new();
+    let pool = PoolConfig::new(ID, 64);
+    let namespace = place.namespace().clone();
+    let config = EngineConfig { namespace, observers: 16, ..EngineConfig::new("gym", pool, 0) };
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let mut engine = Engine::new(memory_gym(), &config).unwrap();
+        let stop = &stop;
+        let running = scope.spawn(move || engine.run(stop).unwrap());
+        let connect = ConnectConfig { timeout: TIMEOUT, ..place.connect_config("gym") };
+        let mut trainer = Trainer::connect(&connect).unwrap();
+        drop(reset(&mut trainer, 0));
+        let rate = |trainer: &mut Trainer| {
+            let (start, mut steps) = (Instant::now(), 0.0);
+            while start.elapsed() < Duration::from_secs(1) {
+                drop(step(trainer, 0));
+                steps += 1.0;
+            }
+            steps / start.elapsed().as_secs_f64()
+        };
+        for count in [1, 4, 16] {
+            let mut ratios: Vec<f64> = (0..ROUNDS)
+                .map(|_| {
+                    let alone = rate(&mut trainer);
+                    let observers: Vec<_> = (0..count).map(|_| place.role("observer gym")).collect();
+                    let connected = || EngineStatus::of(place.namespace(), "gym").unwrap().groups[0].observers.len();
+                    wait_until("observers", || connected() == count);
+                    let observed = rate(&mut trainer);
+                    drop(observers);
+                    wait_until("no observers", || connected() == 0);
+                    observed / alone
+                })
+                .collect();
+            ratios.sort_by(f64::total_cmp);
+            println!("{count} observers: {:.3} ({:.3} to {:.3})", ratios[ROUNDS / 2], ratios[0], ratios[ROUNDS - 1]);
+        }
+        stop.store(true, Ordering::Relaxed);
+        running.join().unwrap();
+    });
+}
