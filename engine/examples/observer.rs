@@ -1,4 +1,4 @@
-//! An observer watches a trainer's batches without slowing it.
+//! An observer watches a trainer's batches as they come.
 //!
 //! ```console
 //! cargo run --release --example observer example     # beside the engine and the trainer of the example `trainer`

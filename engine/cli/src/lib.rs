@@ -66,11 +66,10 @@ enum Command {
     Serve(serve::Args),
     /// Show what the running engines are doing, without disturbing them.
     Status(status::Args),
-    /// Watch a training run without slowing it: steps per second, episodes, returns and lengths, until Ctrl-C or the
+    /// Watch a training run, which does not wait for it: steps per second, episodes, returns and lengths, until Ctrl-C or the
     /// engine's end.
     Watch(watch::Args),
-    /// Show the environments of a running engine in a browser on this machine or in the terminal, without slowing the
-    /// training.
+    /// Show the environments of a running engine in a browser on this machine or in the terminal.
     View(view::Args),
     /// Play an environment in a browser on this machine or in the terminal.
     Play(play_command::Args),

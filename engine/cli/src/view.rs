@@ -14,7 +14,7 @@ use super::{stop, terminal, watch};
 
 /// Arguments of `endless view`.
 ///
-/// The view is an observer, so it does not slow the training. Ctrl-C ends it; in the terminal, so do Q and Esc.
+/// The view is an observer, for which the training does not wait. Ctrl-C ends it; in the terminal, so do Q and Esc.
 #[derive(clap::Args)]
 pub struct Args {
     /// Name of the engine; the page can be opened before it starts [default: the page lists the running engines; in the

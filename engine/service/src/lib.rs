@@ -10,7 +10,7 @@
 //! | --- | --- | --- | --- |
 //! | `endless-gym/NAME/INCARNATION/act/GROUP` | publish/subscribe | trainer → engine | requests |
 //! | `endless-gym/NAME/INCARNATION/obs/GROUP` | publish/subscribe | engine → trainer, observers | responses |
-//! | `endless-gym/NAME/INCARNATION/to_engine` | event | trainer → engine | number of a group with a request |
+//! | `endless-gym/NAME/INCARNATION/to_engine` | event | trainer → engine | number of a group with a request; the engine wakes its own threads by it, too |
 //! | `endless-gym/NAME/INCARNATION/to_trainer` | event | engine → trainer | number of a group with a response |
 //!
 //! The incarnation is a random number drawn when an engine starts, so that it shares no service with a dead predecessor

@@ -6,24 +6,13 @@ use super::drawn_scene::DrawnScene;
 use super::env_slot::EnvSlot;
 use super::error::PoolError;
 use super::sync::{Mutex, lock};
-use super::threads::Threads;
+use super::threads::{Threads, useful_threads};
 use crate::batch::BatchMut;
 use crate::disjoint::DisjointSlice;
 use crate::envs::Environment;
 
-/// Minimum number of environments per thread.
-const ENVS_FOR_THREAD: usize = 16;
-
-/// Minimum number of environments for using workers. The calling thread finishes fewer before a worker joins.
-const ENVS_FOR_THREADS: usize = 64;
-
 /// The number of an environment, and its error.
 pub(super) type OfEnv = (usize, PoolError);
-
-/// Maximum number of threads that step that many environments at the same time.
-pub(super) fn useful_threads(num_envs: usize) -> usize {
-    if num_envs < ENVS_FOR_THREADS { 1 } else { num_envs / ENVS_FOR_THREAD }
-}
 
 /// Consecutive environments, with their drawn scenes and their rows of the batch.
 pub(super) struct EnvRange<'a, E: Environment> {

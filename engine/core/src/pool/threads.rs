@@ -11,10 +11,20 @@ mod workers;
 use std::ops::Range;
 use std::time::Duration;
 
-use super::division::useful_threads;
 use super::error::PoolError;
 #[cfg(feature = "threads")]
 use crate::batch::limits::MAX_THREADS;
+
+/// Minimum number of environments per thread.
+const ENVS_FOR_THREAD: usize = 16;
+
+/// Minimum number of environments for using workers. The calling thread finishes fewer before a worker joins.
+const ENVS_FOR_THREADS: usize = 64;
+
+/// Maximum number of threads that step that many environments at the same time.
+pub(super) fn useful_threads(num_envs: usize) -> usize {
+    if num_envs < ENVS_FOR_THREADS { 1 } else { num_envs / ENVS_FOR_THREAD }
+}
 
 /// Where the time of steps on several threads went. The sum of `opening`, `joining`, `working` and `waiting` is the time between
 /// the calls of the threads and their end; what a step takes beyond it is the calling thread's alone.

@@ -153,11 +153,6 @@ impl Doorbell {
     }
 }
 
-/// Locks a mutex, even one that was held during a panic.
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Parked {
     /// Wakes the waiters of these events. The leader polls for those that nobody waits for.
     fn ring(&mut self, events: u128, leader: ThreadId) {
@@ -175,6 +170,11 @@ impl Parked {
 /// The bit of an event's id, at most [`MAX_GROUPS`](crate::MAX_GROUPS).
 fn bit(id: usize) -> u128 {
     1_u128.checked_shl(id as u32).unwrap_or_default()
+}
+
+/// Locks a mutex, even one that was held during a panic.
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
