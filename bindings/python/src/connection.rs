@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 use endless_gym::batch::Block;
 use endless_gym::pool::{NextOptions, OptionMap};
 use endless_gym::service::{
-    self, BatchLease, ConnectConfig, GroupReconnection, LastRequest, Namespace, ServiceError, Trainer,
+    self, BatchLease, ConnectConfig, GroupReconnection, LastRequest, Namespace, ServiceError, Trainer, TrainerGroup,
 };
-use pyo3::exceptions::PyRuntimeError;
+use pyo3::exceptions::{PyIndexError, PyRuntimeError};
 use pyo3::prelude::*;
 use pyo3::sync::MutexExt;
 use pyo3::types::{PyBytes, PyList, PyTuple};
@@ -23,7 +23,7 @@ use crate::{errors, logs};
 /// Longest time between two runs of Python's signal handlers, including that of Ctrl-C.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Longest time for which a waiting thread keeps the trainer from others.
+/// Longest time for which a waiting thread keeps a group from others.
 const SHARED_SLICE: Duration = Duration::from_millis(1);
 
 /// The steps of a group in the current engine and in the lost one, and what became of the last request.
@@ -41,15 +41,30 @@ unsafe impl Owner for Lease {
     }
 }
 
-/// The trainer of an engine in another process. Threads may call it at the same time: none holds the trainer while it waits for
-/// the interpreter's lock, and a waiting thread gives it away between slices of its timeout.
+/// A group of the trainer.
+struct Group {
+    /// `None` after `close`. A thread that locks several groups does so in the order of their numbers.
+    trainer: Mutex<Option<TrainerGroup>>,
+    /// Whether threads have competed for the group, so that slices must be short.
+    is_shared: AtomicBool,
+}
+
+impl Group {
+    /// Locks the group, in a thread without the interpreter's lock.
+    fn lock(&self) -> MutexGuard<'_, Option<TrainerGroup>> {
+        self.trainer.try_lock().unwrap_or_else(|_| {
+            self.is_shared.store(true, Ordering::Relaxed);
+            lock(&self.trainer)
+        })
+    }
+}
+
+/// The trainer of an engine in another process. Threads may call it at the same time, and those that use different groups do not
+/// wait for each other: none holds a group while it waits for the interpreter's lock, and a waiting thread gives its group away
+/// between slices of its timeout.
 #[pyclass(frozen, module = "endless_gym._native")]
 pub struct Connection {
-    /// `None` after `close`.
-    trainer: Mutex<Option<Trainer>>,
-    /// Whether threads have competed for the trainer, so that slices must be short.
-    is_shared: AtomicBool,
-    groups: usize,
+    groups: Vec<Group>,
     /// Seconds to wait for each answer.
     timeout: f64,
     action_shape: ActionShape,
@@ -72,15 +87,14 @@ impl Connection {
         logs::flush(py)?;
         let specification = trainer.specification();
         let action_shape = ActionShape::group(&specification.action_space, specification.num_envs);
-        let groups = specification.groups;
+        let kept = Kept::new(py, specification.groups)?;
+        let group = |group| Group { trainer: Mutex::new(Some(group)), is_shared: AtomicBool::new(false) };
         Ok(Connection {
-            trainer: Mutex::new(Some(trainer)),
-            is_shared: AtomicBool::new(false),
-            groups,
+            groups: trainer.into_groups().into_iter().map(group).collect(),
             timeout,
             action_shape,
             actions: Mutex::default(),
-            kept: Kept::new(py, groups)?,
+            kept,
             process: std::process::id(),
         })
     }
@@ -88,7 +102,7 @@ impl Connection {
     /// Number of groups.
     #[getter]
     fn groups(&self) -> usize {
-        self.groups
+        self.groups.len()
     }
 
     /// The results that the caller does not have yet, by group; it replaces those that it has by `None`.
@@ -99,7 +113,7 @@ impl Connection {
 
     /// The engine's specification, as JSON text.
     fn specification(&self, py: Python<'_>) -> PyResult<String> {
-        let text = self.with(py, |trainer| Ok(serde_json::to_string(trainer.specification())))?;
+        let text = self.with(py, 0, |group| Ok(serde_json::to_string(group.specification())))?;
         text.map_err(|error| PyRuntimeError::new_err(error.to_string()))
     }
 
@@ -124,11 +138,11 @@ impl Connection {
 
     /// Requests a step, whose result `receive` returns.
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, group: usize) -> PyResult<()> {
-        self.with(py, |_| Ok(()))?;
+        self.with(py, group, |_| Ok(()))?;
         // Reading the actions may call any Python code.
         let mut numbers = std::mem::take(&mut *lock(&self.actions));
         self.action_shape.copy(actions, &mut numbers)?;
-        self.with(py, |trainer| trainer.send(group, &numbers))?;
+        self.with(py, group, |group| group.send(&numbers))?;
         *lock(&self.actions) = numbers;
         self.kept.set(py, group, None)
     }
@@ -137,16 +151,16 @@ impl Connection {
     #[pyo3(signature = (group, request=None, options=None))]
     fn send_reset(&self, py: Python<'_>, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
         let options: Option<OptionMap> = options.map(arguments::options).transpose()?;
-        self.with(py, |trainer| trainer.reset_with(group, Reset::request(request.as_ref()), options.as_ref()))?;
+        self.with(py, group, |group| group.reset_with(Reset::request(request.as_ref()), options.as_ref()))?;
         self.kept.set(py, group, None)
     }
 
     /// Waits for the answer of `group`, or of any group for `None`. Returns the group's number and arrays.
     fn receive<'py>(&self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
-        let received = self.wait(py, |trainer, slice| match group {
-            Some(group) => trainer.receive(group, slice),
-            None => trainer.receive_any(slice),
-        })?;
+        let received = match group {
+            Some(group) => self.wait(py, group, TrainerGroup::receive)?,
+            None => self.receive_any(py)?,
+        };
         let group = received.group();
         let lease = Bound::new(py, Lease(received))?;
         let arrays = arrays::sections(&lease, lease.get().0.batch().layout())?;
@@ -156,43 +170,52 @@ impl Connection {
 
     /// The state of one environment of a group.
     fn snapshot<'py>(&self, py: Python<'py>, group: usize, env: usize) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self.wait(py, |trainer, slice| trainer.snapshot(group, env, slice))?;
+        let bytes = self.wait(py, group, |group, slice| group.snapshot(env, slice))?;
         Ok(PyBytes::new(py, &bytes))
     }
 
     /// Sets the state of one environment of a group to that of a snapshot.
     fn restore(&self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8]) -> PyResult<()> {
-        self.wait(py, |trainer, slice| trainer.restore(group, env, snapshot, slice))
+        self.wait(py, group, |group, slice| group.restore(env, snapshot, slice))
     }
 
     /// Sets the options of next episodes; see `arguments::options`.
     fn set_options(&self, py: Python<'_>, group: usize, sets: &str) -> PyResult<()> {
         let sets: Vec<NextOptions> = arguments::options(sets)?;
-        self.wait(py, |trainer, slice| trainer.set_options(group, &sets, slice))
+        self.wait(py, group, |group, slice| group.set_options(&sets, slice))
     }
 
     /// Seeds and options of the running episodes.
     fn running_episodes(&self, py: Python<'_>, group: usize, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
-        let episodes = self.wait(py, |trainer, slice| trainer.running_episodes(group, &envs, slice))?;
+        let episodes = self.wait(py, group, |group, slice| group.running_episodes(&envs, slice))?;
         Ok(episodes.into_iter().map(arguments::episode).collect())
     }
 
     /// Saves all environments of the engine to its checkpoint file. Returns the step of each group.
     fn checkpoint(&self, py: Python<'_>) -> PyResult<Vec<u64>> {
-        self.wait(py, Trainer::checkpoint)
+        self.wait(py, 0, TrainerGroup::checkpoint)
     }
 
     /// Connects to the engine of the same name that replaced a lost one. Returns whether it is another engine, its incarnation,
     /// and for each group `(step, lost_step, last_request)`.
     fn reconnect(&self, py: Python<'_>, timeout: f64) -> PyResult<(bool, u64, Vec<GroupFound>)> {
-        self.with(py, |_| Ok(()))?;
+        self.with(py, 0, |_| Ok(()))?;
         logs::start(py)?;
         let found = wait_for_engine(py, timeout, |slice| {
-            lock(&self.trainer).as_mut().map(|trainer| trainer.reconnect(slice)).transpose()
+            let mut locked = self.lock_all();
+            let Some(groups) = locked.iter_mut().map(|group| group.take()).collect::<Option<Vec<_>>>() else {
+                return Ok(None);
+            };
+            let (found, groups) = match Trainer::from_groups(groups) {
+                Ok(mut trainer) => (trainer.reconnect(slice).map(Some), trainer.into_groups()),
+                Err(groups) => (Ok(None), groups),
+            };
+            locked.iter_mut().zip(groups).for_each(|(locked, group)| **locked = Some(group));
+            found
         })?;
         let found = found.ok_or_else(errors::closed)?;
         logs::flush(py)?;
-        for group in 0..if found.restarted { self.groups } else { 0 } {
+        for group in 0..if found.restarted { self.groups.len() } else { 0 } {
             self.kept.set(py, group, None)?;
         }
         let group = |group: GroupReconnection| {
@@ -209,39 +232,65 @@ impl Connection {
     }
 
     /// Disconnects. Arrays remain valid. If another call is waiting, for example when a signal handler calls this, the connection
-    /// is closed as soon as that call gives the trainer away.
+    /// is closed as soon as that call gives its group away.
     fn close(&self, py: Python<'_>) {
-        py.detach(|| *lock(&self.trainer) = None);
+        py.detach(|| self.groups.iter().for_each(|group| *group.lock() = None));
     }
 }
 
 impl Connection {
-    /// Calls the trainer, which answers at once.
-    fn with<T>(&self, py: Python<'_>, call: impl FnOnce(&mut Trainer) -> Result<T, ServiceError>) -> PyResult<T> {
+    /// Calls a group, which answers at once.
+    fn with<T>(
+        &self,
+        py: Python<'_>,
+        group: usize,
+        call: impl FnOnce(&mut TrainerGroup) -> Result<T, ServiceError>,
+    ) -> PyResult<T> {
         self.check_process()?;
+        let group = self.group(group)?;
         // Without a detour through the interpreter's lock, which another thread might take.
-        let mut trainer = match self.trainer.try_lock() {
-            Ok(trainer) => trainer,
-            Err(_) => {
-                self.is_shared.store(true, Ordering::Relaxed);
-                self.trainer.lock_py_attached(py).unwrap_or_else(PoisonError::into_inner)
-            }
-        };
+        let mut trainer = group.trainer.try_lock().unwrap_or_else(|_| {
+            group.is_shared.store(true, Ordering::Relaxed);
+            group.trainer.lock_py_attached(py).unwrap_or_else(PoisonError::into_inner)
+        });
         call(trainer.as_mut().ok_or_else(errors::closed)?).map_err(errors::service)
     }
 
-    /// Waits for an answer of the engine; see [`wait`].
+    /// Waits for an answer to a group; see [`wait`].
     fn wait<T: Send>(
         &self,
         py: Python<'_>,
-        mut answer: impl FnMut(&mut Trainer, Duration) -> Result<T, ServiceError> + Send,
+        group: usize,
+        mut answer: impl FnMut(&mut TrainerGroup, Duration) -> Result<T, ServiceError> + Send,
+    ) -> PyResult<T> {
+        let group = self.group(group)?;
+        self.wait_in_slices(py, std::slice::from_ref(group), |slice| {
+            group.lock().as_mut().map(|group| answer(group, slice)).transpose()
+        })
+    }
+
+    /// Waits for the first batch of any group.
+    fn receive_any(&self, py: Python<'_>) -> PyResult<BatchLease> {
+        self.wait_in_slices(py, &self.groups, |slice| {
+            let mut locked = self.lock_all();
+            let groups: Option<Vec<_>> = locked.iter_mut().map(|group| group.as_mut()).collect();
+            groups.map(|mut groups| TrainerGroup::receive_any(&mut groups, slice)).transpose()
+        })
+    }
+
+    /// Waits for an answer to one of these groups, which `answer` locks for a slice of the timeout. `None` means that the connection
+    /// is closed.
+    fn wait_in_slices<T: Send>(
+        &self,
+        py: Python<'_>,
+        groups: &[Group],
+        mut answer: impl FnMut(Duration) -> Result<Option<T>, ServiceError> + Send,
     ) -> PyResult<T> {
         self.check_process()?;
         let timeout = arguments::timeout(self.timeout)?;
         let answer = wait(py, timeout, |slice| {
-            let is_shared = self.is_shared.load(Ordering::Relaxed);
-            let slice = if is_shared { slice.min(SHARED_SLICE) } else { slice };
-            let answer = lock(&self.trainer).as_mut().map(|trainer| answer(trainer, slice)).transpose();
+            let is_shared = groups.iter().any(|group| group.is_shared.load(Ordering::Relaxed));
+            let answer = answer(if is_shared { slice.min(SHARED_SLICE) } else { slice });
             if is_shared && matches!(answer, Err(ServiceError::TimedOut { .. })) {
                 // A mutex is not fair: the other threads need time to take it.
                 std::thread::sleep(SHARED_SLICE / 10);
@@ -249,6 +298,14 @@ impl Connection {
             answer
         })?;
         answer.ok_or_else(errors::closed)
+    }
+
+    fn lock_all(&self) -> Vec<MutexGuard<'_, Option<TrainerGroup>>> {
+        self.groups.iter().map(Group::lock).collect()
+    }
+
+    fn group(&self, group: usize) -> PyResult<&Group> {
+        self.groups.get(group).ok_or_else(|| PyIndexError::new_err(format!("there is no group {group}")))
     }
 
     /// An error if the connection belongs to another process.

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,14 @@ from endless_gym.program import program
 
 MEMORY_GYM = [id for id in endless_gym.all_specs() if not id.startswith("popgym-")]
 WHERE = [endless_gym.make_vec, endless_gym.serve]
+
+
+def stop(process: int) -> None:
+    """Stop a process, and wait until all of its threads have stopped."""
+    os.kill(process, signal.SIGSTOP)
+    tasks = Path(f"/proc/{process}/task")
+    while any(task.joinpath("stat").read_text().rpartition(") ")[2][0] != "T" for task in tasks.iterdir()):
+        time.sleep(0.001)
 
 
 def exact(value: Any) -> Any:

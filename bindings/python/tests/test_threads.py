@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from support import stop
 
 import endless_gym
 
@@ -70,7 +71,7 @@ def test_calls_of_other_threads_succeed_while_one_waits_for_a_stopped_engine() -
         ]
         engine = psutil.Process(envs._engine.pid)
         for call in calls:
-            engine.suspend()
+            stop(engine.pid)
             envs.send(ACTIONS, 1)
             waiting = threads.submit(envs.recv, 1)
             other = threads.submit(call)
@@ -81,6 +82,29 @@ def test_calls_of_other_threads_succeed_while_one_waits_for_a_stopped_engine() -
             engine.resume()
             assert waiting.result(30)[4]["group"] == 1
             other.result(30)
+
+
+def test_a_thread_does_not_wait_for_one_that_waits_for_another_group() -> None:
+    """A thread that had the connection to itself would keep it for up to 50 milliseconds at a time, and then for one."""
+    took = []
+    for _ in range(7):
+        with endless_gym.serve(ID, 4, groups=3) as envs, ThreadPoolExecutor(2) as threads:
+            for group in range(3):
+                envs.reset(group=group)
+            engine = psutil.Process(envs._engine.pid)
+            stop(engine.pid)
+            for group in range(2):
+                envs.send(ACTIONS, group)
+            waiting = [threads.submit(envs.recv, group) for group in range(2)]
+            time.sleep(0.06)
+            start = time.monotonic()
+            envs.send(ACTIONS, 2)
+            took.append(time.monotonic() - start)
+            assert not any(each.done() for each in waiting)
+            engine.resume()
+            assert [each.result(30)[4]["group"] for each in waiting] == [0, 1]
+            assert envs.recv()[4]["group"] == 2
+    assert sorted(took)[3] < 0.01, took
 
 
 @pytest.mark.parametrize("where", WHERE)
