@@ -241,7 +241,7 @@ impl Trainer {
     /// [`ServiceError::OptionsTooLong`], [`ServiceError::AnswerPending`] if the group has a pending batch,
     /// [`ServiceError::Rejected`] if there is no such environment or an option is not valid, and the errors of
     /// [`receive`](Trainer::receive). A rejected call changes no environment, unless its JSON text is longer than
-    /// [`SNAPSHOT_BYTES`] and so takes several messages.
+    /// [`SNAPSHOT_BYTES`](endless_gym_core::batch::SNAPSHOT_BYTES) and so takes several messages.
     ///
     /// ```no_run
     /// # use std::time::Duration;

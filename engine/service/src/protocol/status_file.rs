@@ -523,7 +523,7 @@ mod tests {
         let group = GroupRecord { step: 7, taken: 9, held: 2, ..GroupRecord::default() };
         file.write_group(1, &group);
         assert_eq!((reader.group(0), reader.group(1)), (Some(GroupRecord::default()), Some(group)));
-        assert_eq!(reader.group(2), None);
+        assert_eq!(reader.group(9), None, "beyond the end");
         assert!(reader.is_alive());
         drop(file);
         assert!(!path.exists() && !reader.is_alive());
