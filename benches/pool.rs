@@ -27,7 +27,7 @@ fn measure(
 }
 
 fn config(spec: &EnvSpec, num_envs: usize) -> PoolConfig {
-    PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, num_envs) }
+    PoolConfig::new(spec.id, num_envs).seeding(Seeding::Continue { seed: Some(1) })
 }
 
 /// Every id, with batches inside and beyond the CPU's caches.
@@ -67,7 +67,7 @@ fn formats(criterion: &mut Criterion) {
         ("grayscale_stack_4", PixelFormat { grayscale: true, ..plain }, 4),
         ("grayscale_stack_16", PixelFormat { grayscale: true, ..plain }, 16),
     ] {
-        let config = PoolConfig { frames: Some(Frames { format, stack }), ..config(spec, 64) };
+        let config = config(spec, 64).frames(Some(Frames { format, stack }));
         measure(&mut group, name.to_owned(), spec, &config, 1);
     }
 }
@@ -78,7 +78,7 @@ fn save(criterion: &mut Criterion) {
     for spec in memory_gym().specs() {
         for stack in [1, 4] {
             let frames = Some(Frames { stack, ..Frames::default() });
-            let config = PoolConfig { frames, ..config(spec, 1024) };
+            let config = config(spec, 1024).frames(frames);
             let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
             pool.reset(ResetRequest::All, &mut zeroed(pool.layout().blocks())).unwrap();
             let name = format!("{}/stack_{stack}", spec.id);

@@ -36,7 +36,7 @@ fn service(criterion: &mut Criterion) {
         let mut actions = Actions::new(spec, num_envs);
 
         // The step alone, for comparison.
-        let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(ID, num_envs) };
+        let config = PoolConfig::new(ID, num_envs).seeding(Seeding::Continue { seed: Some(1) });
         let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut batch = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut batch).unwrap();
@@ -55,7 +55,7 @@ fn service(criterion: &mut Criterion) {
                 .spawn()
                 .unwrap(),
         );
-        let config = ConnectConfig { timeout: PATIENCE, ..ConnectConfig::new(&name) };
+        let config = ConnectConfig::new(&name).timeout(PATIENCE);
         let mut trainer = Trainer::connect(&config).unwrap();
         trainer.reset(0, ResetRequest::All).unwrap();
         drop(trainer.receive(0, PATIENCE).unwrap());

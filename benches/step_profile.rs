@@ -116,7 +116,7 @@ impl<E: Environment> Players<E> {
 type Step = Box<dyn FnMut()>;
 
 fn pool(spec: &'static EnvSpec, num_envs: usize) -> Pool {
-    let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, num_envs) };
+    let config = PoolConfig::new(spec.id, num_envs).seeding(Seeding::Continue { seed: Some(1) });
     Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap()
 }
 

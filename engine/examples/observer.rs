@@ -16,7 +16,7 @@ const REPORT_EVERY: Duration = Duration::from_secs(1);
 
 fn main() -> Result<(), Box<dyn Error>> {
     let service = std::env::args().nth(1).unwrap_or_else(|| "endless".to_owned());
-    let mut observer = Observer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(&service) }, 0)?;
+    let mut observer = Observer::connect(&ConnectConfig::new(&service).timeout(TIMEOUT), 0)?;
     let num_envs = observer.specification().num_envs;
     println!("watching {service}");
     let (mut first, mut since) = (None, Instant::now());

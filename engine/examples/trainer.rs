@@ -16,7 +16,7 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 
 fn main() -> Result<(), Box<dyn Error>> {
     let service = std::env::args().nth(1).unwrap_or_else(|| "endless".to_owned());
-    let mut trainer = Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(&service) })?;
+    let mut trainer = Trainer::connect(&ConnectConfig::new(&service).timeout(TIMEOUT))?;
     let num_envs = trainer.specification().num_envs;
     let branches = trainer.specification().action_space.width();
 

@@ -23,7 +23,7 @@ const INFERENCE_TIME: Duration = Duration::from_micros(100);
 fn main() -> Result<(), Box<dyn Error>> {
     // Usually a process of its own: `endless serve --groups 2 --service two-groups ...`.
     let config = EngineConfig::new(SERVICE, PoolConfig::new(ID, NUM_ENVS), 1);
-    let mut engine = Engine::new(memory_gym(), &EngineConfig { groups: 2, ..config })?;
+    let mut engine = Engine::new(memory_gym(), &config.groups(2))?;
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let running = scope.spawn(|| engine.run(&stop));
@@ -38,7 +38,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 /// Plays both groups and returns how long it took.
 fn play() -> Result<Duration, ServiceError> {
-    let mut trainer = Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(SERVICE) })?;
+    let mut trainer = Trainer::connect(&ConnectConfig::new(SERVICE).timeout(TIMEOUT))?;
     let actions = vec![0; NUM_ENVS * trainer.specification().action_space.width()];
     for group in 0..2 {
         trainer.reset(group, ResetRequest::Seed(0))?;

@@ -49,13 +49,11 @@ fn steps_and_resets_allocate_nothing() {
     let sizes = [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1), (Autoreset::NextStep, 320, 20)];
     for (number, spec) in environments().specs().enumerate() {
         for (autoreset, num_envs, threads) in sizes.into_iter().take(if number == 0 { 3 } else { 2 }) {
-            let config = PoolConfig {
-                seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
-                autoreset,
-                final_observation: true,
-                features: true,
-                ..PoolConfig::new(spec.id, num_envs)
-            };
+            let config = PoolConfig::new(spec.id, num_envs)
+                .seeding(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) })
+                .autoreset(autoreset)
+                .final_observation(true)
+                .features(true);
             let mut player = Player::in_registry(environments(), &config, threads);
             let mut other = zeroed(player.blocks.len());
             let mut random = SmallRng::seed_from_u64(1);

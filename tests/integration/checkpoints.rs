@@ -24,16 +24,14 @@ fn config(spec: &'static EnvSpec) -> impl Strategy<Value = PoolConfig> {
     let frames = (pixel_format(), prop::sample::select(vec![1, 1, 2, 4]));
     let frames = prop::option::weighted(0.8, frames.prop_map(|(format, stack)| Frames { format, stack }));
     (options, seeding, autoreset, frames, any::<bool>()).prop_map(|(options, seeding, autoreset, frames, features)| {
-        PoolConfig {
-            options,
-            seeding,
-            autoreset,
-            frames,
-            features,
-            final_observation: true,
-            check_drawing: true,
-            ..PoolConfig::new(spec.id, NUM_ENVS)
-        }
+        PoolConfig::new(spec.id, NUM_ENVS)
+            .options(options)
+            .seeding(seeding)
+            .autoreset(autoreset)
+            .frames(frames)
+            .features(features)
+            .final_observation(true)
+            .check_drawing(true)
     })
 }
 
@@ -78,11 +76,9 @@ fn resumed_environments_continue_identically() {
 fn a_pending_reset_of_next_step_autoreset_is_part_of_the_state() {
     // Random agents fail soon, so that saves hit every phase of an episode's end.
     for autoreset in Autoreset::ALL {
-        let config = PoolConfig {
-            autoreset,
-            seeding: Seeding::Range { start: 0, end: 50, step: 1, seed: Some(1) },
-            ..PoolConfig::new("Endless-MortarMayhem-v0", NUM_ENVS)
-        };
+        let config = PoolConfig::new("Endless-MortarMayhem-v0", NUM_ENVS)
+            .autoreset(autoreset)
+            .seeding(Seeding::Range { start: 0, end: 50, step: 1, seed: Some(1) });
         (100..120).for_each(|before| compare(&config, before, 3));
     }
 }
@@ -90,7 +86,7 @@ fn a_pending_reset_of_next_step_autoreset_is_part_of_the_state() {
 #[test]
 fn resuming_a_state_that_does_not_fit_is_an_error() {
     let frames = |stack| Some(Frames { stack, ..Frames::default() });
-    let pool = |num_envs, frames| Player::new(&PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", num_envs) });
+    let pool = |num_envs, frames| Player::new(&PoolConfig::new("MysteryPath-v0", num_envs).frames(frames));
     let mut saving = pool(2, frames(3));
     saving.reset(ResetRequest::All);
     let mut saved = saving.pool.save().unwrap().unwrap();

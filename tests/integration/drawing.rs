@@ -21,7 +21,7 @@ const NUM_ENVS: usize = 3;
 
 fn config(spec: &EnvSpec) -> PoolConfig {
     let seeding = Seeding::Continue { seed: Some(3) };
-    PoolConfig { seeding, check_drawing: true, ..PoolConfig::new(spec.id, NUM_ENVS) }
+    PoolConfig::new(spec.id, NUM_ENVS).seeding(seeding).check_drawing(true)
 }
 
 fn pool(config: &PoolConfig) -> Pool {
@@ -90,7 +90,7 @@ fn many_circles_of_light_are_drawn_correctly_into_irregular_buffers() {
         let options =
             [("initial_spawns", json!(spotlights)), ("spot_min_speed", json!(0.002)), ("spot_damage", json!(0.0))];
         let options = options.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
-        let config = PoolConfig { options: ResetOptions::Shared(options), ..config(spec) };
+        let config = config(spec).options(ResetOptions::Shared(options));
         let mut random = SmallRng::seed_from_u64(spotlights);
         let played = play_irregularly(&mut pool(&config), &mut pool(&config), 300, &mut random);
         assert!(played.is_ok(), "{spotlights} spotlights: {}", played.unwrap_err());
@@ -111,13 +111,7 @@ proptest! {
         seed: u64,
     ) {
         let autoreset = if same_step { Autoreset::SameStep } else { Autoreset::NextStep };
-        let with = |given| PoolConfig {
-            options: ResetOptions::Shared(given),
-            autoreset,
-            final_observation: true,
-            frames: Some(Frames { format, stack }),
-            ..config(spec)
-        };
+        let with = |given| config(spec).options(ResetOptions::Shared(given)).autoreset(autoreset).final_observation(true).frames(Some(Frames { format, stack }));
         let (mut one, mut other) = (pool(&with(given)), pool(&with(others)));
         let mut random = SmallRng::seed_from_u64(seed);
         let played = play_irregularly(&mut one, &mut other, 120, &mut random);
@@ -130,7 +124,7 @@ proptest! {
 fn a_single_frame_equals_the_observation_even_without_frames_in_the_batch() {
     for spec in memory_gym().specs() {
         for autoreset in [Autoreset::SameStep, Autoreset::NextStep] {
-            let with = |frames| pool(&PoolConfig { features: true, frames, autoreset, ..config(spec) });
+            let with = |frames| pool(&config(spec).features(true).frames(frames).autoreset(autoreset));
             let (mut seen, mut drawn) = (with(Some(Frames::default())), with(None));
             assert!(matches!(drawn.frame(0), Err(PoolError::NotReset)));
             let mut buffers = [&seen, &drawn].map(|pool| zeroed(pool.layout().blocks()));
@@ -180,9 +174,7 @@ fn the_drawing_check_finds_a_changed_pixel() {
     pool.step(&[0; NUM_ENVS], &mut buffer).unwrap();
 
     // Without the check, the changed pixel stays.
-    let mut unchecked =
-        Pool::new(memory_gym(), &PoolConfig { check_drawing: false, ..config(spec) }, &Threads::new(1).unwrap())
-            .unwrap();
+    let mut unchecked = Pool::new(memory_gym(), &config(spec).check_drawing(false), &Threads::new(1).unwrap()).unwrap();
     unchecked.reset(ResetRequest::All, &mut buffer).unwrap();
     let before = Batch::new(&layout, &buffer).observation().to_vec();
     corrupt(&mut buffer);

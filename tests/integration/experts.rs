@@ -8,8 +8,7 @@ use endless_gym::pool::{Experts, PoolConfig, Seeding};
 /// Returns the info of each first episode that ended.
 fn play(id: &str, num_envs: usize, steps: usize) -> Vec<Option<Vec<f64>>> {
     let spec = memory_gym().spec(id).unwrap();
-    let config =
-        PoolConfig { features: true, seeding: Seeding::Continue { seed: Some(0) }, ..PoolConfig::new(id, num_envs) };
+    let config = PoolConfig::new(id, num_envs).features(true).seeding(Seeding::Continue { seed: Some(0) });
     let mut player = Player::started(&config);
     let mut experts = Experts::new(memory_gym(), spec.id, num_envs, config.autoreset).unwrap();
     let mut ended = vec![None; num_envs];
@@ -100,7 +99,7 @@ mod pools {
 
     fn config(id: &str, autoreset: Autoreset) -> PoolConfig {
         let seeding = Seeding::List(vec![5, 6, 7, 8, 9, 10]);
-        PoolConfig { features: true, frames: None, autoreset, seeding, ..PoolConfig::new(id, NUM_ENVS) }
+        PoolConfig::new(id, NUM_ENVS).features(true).frames(None).autoreset(autoreset).seeding(seeding)
     }
 
     /// Plays until every environment has ended [`EPISODES`] episodes.
@@ -135,7 +134,7 @@ mod pools {
         let spec = memory_gym().spec(id).unwrap();
         std::array::from_fn(|env| {
             let episode = |number: usize| {
-                let config = PoolConfig { num_envs: 1, total_envs: 1, ..config(id, Autoreset::Disabled) };
+                let config = config(id, Autoreset::Disabled).num_envs(1).total_envs(1);
                 let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
                 let mut blocks = zeroed(pool.layout().blocks());
                 let seed = 5 + (number * NUM_ENVS + env) as u64 % 6;
@@ -178,10 +177,10 @@ mod pools {
         let needed = NUM_ENVS * memory_gym().spec(id).unwrap().features.len();
         assert_eq!(act(&pool(&good), &mut [0; NUM_ENVS]), Ok(()));
         assert_eq!(act(&pool(&good), &mut [0; 2]), Err(ExpertsError::Actions { given: 2, needed: NUM_ENVS }));
-        let plain = PoolConfig { features: false, ..good.clone() };
+        let plain = good.clone().features(false);
         let error = ExpertsError::Features { given: 0, needed, num_envs: NUM_ENVS };
         assert_eq!(act(&pool(&plain), &mut [0; NUM_ENVS]), Err(error));
-        let fewer = PoolConfig { num_envs: 2, total_envs: 2, ..good };
+        let fewer = good.num_envs(2).total_envs(2);
         let error = ExpertsError::Features { given: needed / 3 * 2, needed, num_envs: NUM_ENVS };
         assert_eq!(act(&pool(&fewer), &mut [0; NUM_ENVS]), Err(error));
     }

@@ -172,7 +172,7 @@ pub fn stuck_trainer() -> ! {
         &format!("faulty serve --num-envs=100 --groups=2 --service=gym --child={}", std::process::id()),
     );
     let engine = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
-    stick(&mut Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new("gym") }).unwrap());
+    stick(&mut Trainer::connect(&ConnectConfig::new("gym").timeout(TIMEOUT)).unwrap());
     println!("\nengine {}", engine.id());
     std::thread::sleep(Duration::from_secs(600));
     std::process::exit(1)

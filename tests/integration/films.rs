@@ -19,12 +19,8 @@ type Picture = Vec<[u8; 3]>;
 /// The observation and the ground-truth view, 84x84 in rows, of each step of an expert's episode.
 fn frames(id: &str, seed: u64, max_steps: usize) -> Vec<(Picture, Picture)> {
     let format = PixelFormat { row_major: true, ..PixelFormat::default() };
-    let config = PoolConfig {
-        features: true,
-        frames: Some(Frames { format, stack: 1 }),
-        autoreset: Autoreset::Disabled,
-        ..PoolConfig::new(id, 1)
-    };
+    let config =
+        PoolConfig::new(id, 1).features(true).frames(Some(Frames { format, stack: 1 })).autoreset(Autoreset::Disabled);
     let mut player = Player::new(&config);
     player.reset(ResetRequest::Seed(seed));
     let spec = player.pool.spec();

@@ -39,14 +39,14 @@ fn convert(frame: &[u8], format: PixelFormat) -> Vec<u8> {
 fn started(spec: &EnvSpec, frames: Frames) -> Player {
     let is_max_steps = |parameter: &&Parameter| parameter.name == "max_steps";
     let options = spec.parameters.iter().find(is_max_steps).map(|_| ("max_steps".to_owned(), Json::from(70)));
-    Player::started(&PoolConfig {
-        options: ResetOptions::Shared(options.into_iter().collect()),
-        frames: Some(frames),
-        seeding: Seeding::Continue { seed: Some(5) },
-        autoreset: Autoreset::SameStep,
-        final_observation: true,
-        ..PoolConfig::new(spec.id, NUM_ENVS)
-    })
+    Player::started(
+        &PoolConfig::new(spec.id, NUM_ENVS)
+            .options(ResetOptions::Shared(options.into_iter().collect()))
+            .frames(Some(frames))
+            .seeding(Seeding::Continue { seed: Some(5) })
+            .autoreset(Autoreset::SameStep)
+            .final_observation(true),
+    )
 }
 
 fn row(player: &Player, section: BatchSection, env: usize) -> &[u8] {
@@ -116,7 +116,7 @@ fn every_format_is_a_plain_conversion() {
 fn stacks_of_0_or_65_frames_are_refused() {
     for given in [0, 65] {
         let frames = Some(Frames { stack: given, ..Frames::default() });
-        let config = PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", 1) };
+        let config = PoolConfig::new("MysteryPath-v0", 1).frames(frames);
         let error = config.validate(memory_gym().spec("MysteryPath-v0").unwrap()).unwrap_err();
         assert!(matches!(error, PoolError::Stack { given: found } if found == given), "{error}");
     }

@@ -36,7 +36,7 @@ fn episode(player: &mut Player, seed: u64, options: &OptionMap, steps: usize) ->
 }
 
 fn config(spec: &EnvSpec, independent_episodes: bool) -> PoolConfig {
-    PoolConfig { autoreset: Autoreset::NextStep, independent_episodes, features: true, ..PoolConfig::new(spec.id, 1) }
+    PoolConfig::new(spec.id, 1).autoreset(Autoreset::NextStep).independent_episodes(independent_episodes).features(true)
 }
 
 fn with_options() -> impl Strategy<Value = (&'static EnvSpec, OptionMap, OptionMap)> {
@@ -113,10 +113,8 @@ fn short_episodes(spec: &EnvSpec) -> ResetOptions {
 #[test]
 fn later_episodes_depend_on_the_seed_and_not_on_earlier_actions() {
     for spec in memory_gym().specs() {
-        let seeded = |independent, seed| PoolConfig {
-            seeding: Seeding::Continue { seed },
-            options: short_episodes(spec),
-            ..config(spec, independent)
+        let seeded = |independent, seed| {
+            config(spec, independent).seeding(Seeding::Continue { seed }).options(short_episodes(spec))
         };
         let all = starts(&seeded(true, Some(5)), 1, None);
         assert!(all[1..].iter().any(|start| *start != all[0]), "{}: not the same again", spec.id);

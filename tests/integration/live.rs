@@ -83,12 +83,10 @@ fn case(spec: &'static EnvSpec) -> impl Strategy<Value = Case> {
 
 /// Plays a case in the engine. Returns the request that makes the original play the same.
 fn play(spec: &'static EnvSpec, case: &Case) -> Json {
-    let config = PoolConfig {
-        options: ResetOptions::Shared(case.options.clone()),
-        autoreset: Autoreset::Disabled,
-        features: true,
-        ..PoolConfig::new(spec.id, 1)
-    };
+    let config = PoolConfig::new(spec.id, 1)
+        .options(ResetOptions::Shared(case.options.clone()))
+        .autoreset(Autoreset::Disabled)
+        .features(true);
     let mut player = Player::new(&config);
     let mut random = SmallRng::seed_from_u64(case.action_seed);
     let branches = spec.action_space.branches();

@@ -20,7 +20,7 @@ impl Named {
             options.insert("command_show_delay".to_owned(), json!([0]));
         }
         let options = ResetOptions::Shared(options);
-        let config = PoolConfig { options, features: true, ..PoolConfig::new(spec.id, 1) };
+        let config = PoolConfig::new(spec.id, 1).options(options).features(true);
         let mut player = Named(Player::new(&config));
         player.0.reset(ResetRequest::Seed(seed));
         while player.any_feature("command_") {

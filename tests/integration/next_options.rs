@@ -27,7 +27,7 @@ fn running(player: &Player, env: usize) -> Json {
 }
 
 fn config(num_envs: usize, autoreset: Autoreset) -> PoolConfig {
-    PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, autoreset, ..PoolConfig::new(ID, num_envs) }
+    PoolConfig::new(ID, num_envs).seeding(Seeding::Continue { seed: Some(3) }).autoreset(autoreset)
 }
 
 #[test]
@@ -78,10 +78,8 @@ fn next_options_apply_from_the_next_episode_on_in_every_autoreset_mode() {
 #[test]
 fn an_episode_with_next_options_equals_that_of_a_pool_created_with_them() {
     let wanted = json!({"command_count": [2], "arena_size": 4});
-    let mut made = Player::new(&PoolConfig {
-        options: endless_gym::pool::ResetOptions::Shared(options(&wanted)),
-        ..config(2, Autoreset::NextStep)
-    });
+    let mut made =
+        Player::new(&config(2, Autoreset::NextStep).options(endless_gym::pool::ResetOptions::Shared(options(&wanted))));
     let mut set = Player::new(&config(2, Autoreset::NextStep));
     set.pool.set_options(&[next(&wanted, &[0, 1])]).unwrap();
     for player in [&mut made, &mut set] {
@@ -144,7 +142,7 @@ fn refused_next_options_change_nothing() {
 #[test]
 fn a_running_episode_reports_its_seed() {
     let seeds = |seeding: Seeding| {
-        let mut player = Player::new(&PoolConfig { seeding, ..config(2, Autoreset::SameStep) });
+        let mut player = Player::new(&config(2, Autoreset::SameStep).seeding(seeding));
         player.reset(ResetRequest::All);
         let mut seen = vec![player.pool.running_episode(0).unwrap().seed];
         while seen.len() < 4 {

@@ -29,7 +29,7 @@ fn registry() -> Registry {
 fn config(autoreset: Autoreset) -> PoolConfig {
     let options = json!({"length": 3, "max_steps": 8}).as_object().unwrap().clone();
     let options = ResetOptions::Shared(options);
-    PoolConfig { options, autoreset, features: true, check_drawing: true, ..PoolConfig::new(ID, NUM_ENVS) }
+    PoolConfig::new(ID, NUM_ENVS).options(options).autoreset(autoreset).features(true).check_drawing(true)
 }
 
 fn player(config: &PoolConfig, threads: usize) -> Player {
@@ -76,7 +76,7 @@ fn truncation_ends_an_episode_and_differs_from_termination() {
 
 /// The observations of 60 steps; the pool compares each frame with one that is drawn in full.
 fn observations(frames: Frames, threads: usize) -> Vec<Vec<u8>> {
-    let mut player = player(&PoolConfig { frames: Some(frames), ..config(Autoreset::NextStep) }, threads);
+    let mut player = player(&config(Autoreset::NextStep).frames(Some(frames)), threads);
     let mut random = SmallRng::seed_from_u64(3);
     player.reset(ResetRequest::Seed(5));
     let mut step = |_| {
@@ -130,7 +130,7 @@ fn a_snapshot_continues_identically_and_a_forged_one_is_refused() {
 #[test]
 fn options_are_checked_and_ids_are_unique() {
     let given = json!({"length": 81}).as_object().unwrap().clone();
-    let config = PoolConfig { options: ResetOptions::Shared(given), ..PoolConfig::new(ID, 1) };
+    let config = PoolConfig::new(ID, 1).options(ResetOptions::Shared(given));
     let error = Pool::new(&registry(), &config, &Threads::new(1).unwrap()).map(drop).unwrap_err();
     assert_eq!(error.to_string(), "reset parameter `length` must be an integer, 1 to 80, got 81");
     let error = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).map(drop).unwrap_err();

@@ -63,12 +63,7 @@ fn frames_are_right<const WIDTH: usize, const HEIGHT: usize, const CHANNELS: usi
     let registry = Registry::new().with::<Dot<WIDTH, HEIGHT, CHANNELS>>().unwrap();
     for (bits, stack) in (0..4).flat_map(|bits| [(bits, 1), (bits, 2)]) {
         let format = PixelFormat { grayscale: false, channels_first: bits & 1 != 0, row_major: bits & 2 != 0 };
-        let config = PoolConfig {
-            features: true,
-            check_drawing: true,
-            frames: Some(Frames { format, stack }),
-            ..PoolConfig::new(ID, 3)
-        };
+        let config = PoolConfig::new(ID, 3).features(true).check_drawing(true).frames(Some(Frames { format, stack }));
         let mut player = Player::in_registry(&registry, &config, 1);
         player.reset(ResetRequest::Seed(1));
         let (first, second) = if format.row_major { (HEIGHT, WIDTH) } else { (WIDTH, HEIGHT) };
@@ -98,9 +93,9 @@ fn frames_are_right<const WIDTH: usize, const HEIGHT: usize, const CHANNELS: usi
                 assert_eq!(newest.iter().filter(|byte| **byte != 0).count(), CHANNELS);
             }
         }
-        let plain = PoolConfig { features: true, ..PoolConfig::new(ID, 3) };
+        let plain = PoolConfig::new(ID, 3).features(true);
         let [mut with, mut without] = [Some(Frames::default()), None]
-            .map(|frames| Player::in_registry(&registry, &PoolConfig { frames, ..plain.clone() }, 1));
+            .map(|frames| Player::in_registry(&registry, &plain.clone().frames(frames), 1));
         for player in [&mut with, &mut without] {
             player.reset(ResetRequest::Seed(1));
             player.step_all(0);
@@ -155,7 +150,7 @@ fn contradictory_specifications_are_refused() {
     assert!(add(Registry::new().with::<Dot<5, 7, 2>>()).contains("1, 3 or 4 channels"));
     let registry = Registry::new().with::<Dot<5, 7, 4>>().unwrap();
     let format = PixelFormat { grayscale: true, ..PixelFormat::default() };
-    let config = PoolConfig { frames: Some(Frames { format, stack: 1 }), ..PoolConfig::new(ID, 1) };
+    let config = PoolConfig::new(ID, 1).frames(Some(Frames { format, stack: 1 }));
     let result = Pool::new(&registry, &config, &Threads::new(1).unwrap());
     assert!(matches!(result, Err(PoolError::Grayscale { id: ID, channels: 4 })));
 }

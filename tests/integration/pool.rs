@@ -23,7 +23,7 @@ fn options(value: Json) -> Map<String, Json> {
 
 /// Episodes are short, since an agent that does nothing fails at the first command to move.
 fn config(num_envs: usize) -> PoolConfig {
-    PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new(ID, num_envs) }
+    PoolConfig::new(ID, num_envs).seeding(Seeding::Continue { seed: Some(3) })
 }
 
 /// The observation of an environment.
@@ -34,17 +34,15 @@ fn frame(player: &Player, env: usize) -> Vec<u8> {
 /// The first observation of the environment with that seed.
 fn first_frame(seed: u64) -> Vec<u8> {
     let seeding = Seeding::Continue { seed: Some(seed) };
-    frame(&Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 1) }), 0)
+    frame(&Player::started(&PoolConfig::new(ID, 1).seeding(seeding)), 0)
 }
 
 #[test]
 fn results_do_not_depend_on_the_number_of_threads() {
     for spec in memory_gym().specs() {
-        let config = PoolConfig {
-            seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
-            features: true,
-            ..PoolConfig::new(spec.id, 331)
-        };
+        let config = PoolConfig::new(spec.id, 331)
+            .seeding(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) })
+            .features(true);
         let mut players = [1, 2, 3, 64].map(|threads| Player::with_threads(&config, threads));
         players.iter_mut().for_each(|player| player.reset(ResetRequest::All));
         let mut random = SmallRng::seed_from_u64(5);
@@ -62,7 +60,7 @@ fn results_do_not_depend_on_the_number_of_threads() {
 #[test]
 fn a_group_is_a_slice_of_all_environments() {
     let whole = Player::started(&config(6));
-    let half = Player::started(&PoolConfig { first_env: 3, total_envs: 6, ..config(3) });
+    let half = Player::started(&config(3).first_env(3).total_envs(6));
     assert_eq!(frame(&half, 0), frame(&whole, 3));
 }
 
@@ -90,8 +88,8 @@ fn next_step_autoreset_starts_an_episode_in_the_step_after_its_end() {
 
 #[test]
 fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
-    let next = PoolConfig { autoreset: Autoreset::NextStep, features: true, ..config(1) };
-    let same = PoolConfig { autoreset: Autoreset::SameStep, final_observation: true, ..next.clone() };
+    let next = config(1).autoreset(Autoreset::NextStep).features(true);
+    let same = next.clone().autoreset(Autoreset::SameStep).final_observation(true);
     let (mut next, mut same) = (Player::started(&next), Player::started(&same));
     let mut ends = 0;
     for _ in 0..300 {
@@ -119,11 +117,10 @@ fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
 
 #[test]
 fn same_step_autoreset_keeps_the_final_vector_observation() {
-    let config = PoolConfig {
-        autoreset: Autoreset::SameStep,
-        final_observation: true,
-        ..PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new("MortarMayhemB-Grid-v0", 1) }
-    };
+    let config = PoolConfig::new("MortarMayhemB-Grid-v0", 1)
+        .seeding(Seeding::Continue { seed: Some(3) })
+        .autoreset(Autoreset::SameStep)
+        .final_observation(true);
     let mut player = Player::started(&config);
     let commands = player.batch().vector_observation().to_vec();
     while player.batch().terminated()[0] == 0 {
@@ -135,7 +132,7 @@ fn same_step_autoreset_keeps_the_final_vector_observation() {
 
 #[test]
 fn disabled_autoreset_leaves_resets_to_the_trainer() {
-    let mut player = Player::started(&PoolConfig { autoreset: Autoreset::Disabled, ..config(3) });
+    let mut player = Player::started(&config(3).autoreset(Autoreset::Disabled));
     let mut random = SmallRng::seed_from_u64(5);
     for _ in 0..30 {
         player.step_at_random(&mut random);
@@ -151,7 +148,7 @@ fn disabled_autoreset_leaves_resets_to_the_trainer() {
 #[test]
 fn episodes_are_seeded_as_configured() {
     let first_frames = |seeding: Seeding, episodes: usize| -> Vec<Vec<u8>> {
-        let mut player = Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 2) });
+        let mut player = Player::started(&PoolConfig::new(ID, 2).seeding(seeding));
         let mut frames = vec![frame(&player, 0), frame(&player, 1)];
         for _ in 1..episodes {
             player.reset(ResetRequest::All);
@@ -172,7 +169,7 @@ fn episodes_are_seeded_as_configured() {
 #[test]
 fn seed_ranges_may_have_a_step() {
     let seeding = Seeding::Range { start: 4, end: 12, step: 3, seed: Some(1) };
-    let player = Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 64) });
+    let player = Player::started(&PoolConfig::new(ID, 64).seeding(seeding));
     let expected: HashSet<Vec<u8>> = [4, 7, 10].map(first_frame).into();
     assert_eq!((0..64).map(|env| frame(&player, env)).collect::<HashSet<_>>(), expected);
 }
@@ -190,7 +187,7 @@ fn all_episodes_after_a_seeded_reset_depend_only_on_its_seed() {
         // episodes.
         let each = [ResetRequest::Seed(50), ResetRequest::Each { reset: &[2, 2], seed: &[50, 51] }];
         let shown = pair.clone().into_iter().zip(each).enumerate().map(|(before, (seeding, request))| {
-            let mut player = Player::started(&PoolConfig { seeding, ..config(2) });
+            let mut player = Player::started(&config(2).seeding(seeding));
             for _ in 0..before {
                 player.reset(ResetRequest::All);
             }
@@ -207,8 +204,7 @@ fn all_episodes_after_a_seeded_reset_depend_only_on_its_seed() {
         let seeds = |seeds: &[u64]| seeds.iter().map(|seed| first_frame(*seed)).collect::<Vec<_>>();
         match pair[0] {
             Seeding::Continue { .. } => {
-                let mut twin =
-                    Player::started(&PoolConfig { seeding: Seeding::Continue { seed: Some(50) }, ..config(2) });
+                let mut twin = Player::started(&config(2).seeding(Seeding::Continue { seed: Some(50) }));
                 twin.pool.reset(ResetRequest::All, &mut twin.blocks).unwrap();
                 assert!(one[2..4] == [frame(&twin, 0), frame(&twin, 1)], "the generator of the seed continues");
             }
@@ -228,7 +224,7 @@ fn the_number_of_threads_is_limited() {
 fn each_environment_may_have_its_own_options() {
     let each = vec![options(json!({})), options(json!({"agent_scale": 0.4})), options(json!({}))];
     let (options, seeding) = (ResetOptions::Each(each), Seeding::List(vec![8]));
-    let player = Player::started(&PoolConfig { options, seeding, ..PoolConfig::new(ID, 3) });
+    let player = Player::started(&PoolConfig::new(ID, 3).options(options).seeding(seeding));
     assert_eq!(frame(&player, 0), first_frame(8));
     assert_ne!(frame(&player, 1), first_frame(8));
     assert_eq!(frame(&player, 2), first_frame(8));
@@ -237,7 +233,7 @@ fn each_environment_may_have_its_own_options() {
 #[test]
 fn a_reset_may_change_the_options() {
     let other = options(json!({"initial_command_count": 4, "agent_scale": 0.5}));
-    let mut fresh = Player::started(&PoolConfig { options: ResetOptions::Shared(other.clone()), ..config(2) });
+    let mut fresh = Player::started(&config(2).options(ResetOptions::Shared(other.clone())));
     let mut player = Player::started(&config(2));
     let before = frame(&player, 1);
     let request = ResetRequest::Each { reset: &[2, 0], seed: &[3, 0] };
@@ -257,9 +253,9 @@ fn a_reset_may_change_the_options() {
 
 #[test]
 fn disabling_frames_changes_nothing_else() {
-    let mut with = Player::started(&PoolConfig { features: true, ..config(3) });
+    let mut with = Player::started(&config(3).features(true));
     let mut random = SmallRng::seed_from_u64(5);
-    let mut without = Player::started(&PoolConfig { features: true, frames: None, ..config(3) });
+    let mut without = Player::started(&config(3).features(true).frames(None));
     for _ in 0..100 {
         let actions = random_actions(with.pool.spec(), 3, &mut random);
         with.step(&actions);
@@ -280,26 +276,25 @@ fn wrong_configurations_are_refused() {
         error
     };
     assert!(config(2).validate(memory_gym().spec(ID).unwrap()).is_ok());
-    let with =
-        |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
+    let with = |given: Json| refused(config(2).options(ResetOptions::Shared(options(given)))).to_string();
     assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
     assert_eq!(refused(config(0)).to_string(), "num_envs must be 1 to 1048576, got 0");
     for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2), (0, 1 << 32)] {
-        let outside = PoolConfig { first_env, total_envs, ..config(3) };
+        let outside = config(3).first_env(first_env).total_envs(total_envs);
         assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
     }
-    assert!(matches!(refused(PoolConfig { seeding: Seeding::List(vec![]), ..config(1) }), PoolError::NoSeeds));
+    assert!(matches!(refused(config(1).seeding(Seeding::List(vec![]))), PoolError::NoSeeds));
     let empty = Seeding::Range { start: 5, end: 5, step: 1, seed: None };
-    assert!(matches!(refused(PoolConfig { seeding: empty, ..config(1) }), PoolError::SeedRange { .. }));
+    assert!(matches!(refused(config(1).seeding(empty)), PoolError::SeedRange { .. }));
     let still = Seeding::Range { start: 4, end: 12, step: 0, seed: None };
-    assert!(matches!(refused(PoolConfig { seeding: still, ..config(1) }), PoolError::SeedStep));
+    assert!(matches!(refused(config(1).seeding(still)), PoolError::SeedStep));
     let two = ResetOptions::Each(vec![Map::new(); 2]);
-    assert!(matches!(refused(PoolConfig { options: two, ..config(3) }), PoolError::OptionsCount { .. }));
+    assert!(matches!(refused(config(3).options(two)), PoolError::OptionsCount { .. }));
     assert!(with(json!({"arena_sise": 5})).contains("`arena_sise`; it has max_steps, agent_scale"));
     assert!(with(json!({"allowed_commands": 3})).contains("`allowed_commands` must be an integer, 4 to 9, got 3"));
     assert!(with(json!({"visual_feedback": 1})).contains("`visual_feedback` must be true or false, got 1"));
     let one_of_two = ResetOptions::Each(vec![Map::new(), options(json!({"agent_speed": "fast"}))]);
-    let text = refused(PoolConfig { options: one_of_two, first_env: 4, total_envs: 6, ..config(2) }).to_string();
+    let text = refused(config(2).options(one_of_two).first_env(4).total_envs(6)).to_string();
     assert!(text.contains("environment 5") && text.contains("agent_speed"), "{text}");
 }
 
@@ -331,12 +326,7 @@ proptest! {
             .prop_flat_map(|spec| (Just(spec), any_options(spec))),
         seed: u64,
     ) {
-        let config = PoolConfig {
-            options: ResetOptions::Shared(given),
-            seeding: Seeding::Continue { seed: Some(seed) },
-            features: true,
-            ..PoolConfig::new(spec.id, 3)
-        };
+        let config = PoolConfig::new(spec.id, 3).options(ResetOptions::Shared(given)).seeding(Seeding::Continue { seed: Some(seed) }).features(true);
         let mut players = [1, 2].map(|threads| Player::with_threads(&config, threads));
         players.iter_mut().for_each(|player| player.reset(ResetRequest::All));
         let mut random = SmallRng::seed_from_u64(5);

@@ -40,13 +40,11 @@ struct Step(Vec<f64>, Vec<f64>, f64, u8, u8, Map<String, Json>);
 
 /// Plays a trace and compares every number. Returns the number of steps.
 fn replay(trace: &Trace) -> usize {
-    let config = PoolConfig {
-        options: ResetOptions::Shared(trace.options.clone()),
-        autoreset: Autoreset::Disabled,
-        frames: None,
-        features: true,
-        ..PoolConfig::new(&trace.env, 1)
-    };
+    let config = PoolConfig::new(&trace.env, 1)
+        .options(ResetOptions::Shared(trace.options.clone()))
+        .autoreset(Autoreset::Disabled)
+        .frames(None)
+        .features(true);
     let mut player = Player::in_registry(popgym(), &config, 1);
     let is_box = matches!(player.pool.spec().action_space, ActionSpace::Box { .. });
     for (number, episode) in trace.episodes.iter().enumerate() {

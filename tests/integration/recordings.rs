@@ -26,11 +26,9 @@ fn a_recording_equals_the_original_trace() {
         let expected =
             Trace::open(&crate::support::recorded::reference().join(format!("traces/{}.03.mixed02.json.gz", spec.id)))
                 .unwrap();
-        let config = PoolConfig {
-            options: ResetOptions::Shared(expected.options.clone()),
-            autoreset: Autoreset::Disabled,
-            ..PoolConfig::new(spec.id, 1)
-        };
+        let config = PoolConfig::new(spec.id, 1)
+            .options(ResetOptions::Shared(expected.options.clone()))
+            .autoreset(Autoreset::Disabled);
         let Player { mut pool, mut blocks } = Player::new(&config);
         let mut recorder = Recorder::new(spec.id, &expected.options);
         for episode in &expected.episodes {
@@ -55,7 +53,7 @@ fn unfinished_recordings_are_replayed() {
     let mut random = SmallRng::seed_from_u64(1);
     for spec in memory_gym().specs() {
         for steps in [0, 1, 25] {
-            let config = PoolConfig { autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
+            let config = PoolConfig::new(spec.id, 1).autoreset(Autoreset::Disabled);
             let Player { mut pool, mut blocks } = Player::new(&config);
             let mut recorder = Recorder::new(spec.id, &Default::default());
             pool.reset(ResetRequest::Seed(steps), &mut blocks).unwrap();
@@ -85,7 +83,7 @@ fn unfinished_recordings_are_replayed() {
 #[test]
 fn progress_ends_at_the_final_info() {
     for spec in memory_gym().specs() {
-        let config = PoolConfig { features: true, autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
+        let config = PoolConfig::new(spec.id, 1).features(true).autoreset(Autoreset::Disabled);
         let Player { mut pool, mut blocks } = Player::new(&config);
         pool.progress(0).unwrap_err();
         let mut expert = memory_gym().expert(spec.id).unwrap();

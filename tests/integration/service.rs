@@ -140,7 +140,7 @@ fn the_error_for_an_unknown_engine_lists_the_running_ones() {
         assert_error!(place.trainer_now("gym"), ServiceError::UnknownEngine { service, .. } if service == "gym");
     assert!(error.to_string().contains("running engines: other"), "{error}");
     assert_eq!(running_engines(place.namespace()).unwrap(), ["other"]);
-    let config = ConnectConfig { namespace: place.namespace().clone(), ..ConnectConfig::new("a/b") };
+    let config = ConnectConfig::new("a/b").namespace(place.namespace().clone());
     assert_error!(Trainer::connect(&config), ServiceError::InvalidName { .. });
 }
 

@@ -9,7 +9,7 @@ use crate::support::place::Place;
 use crate::support::recorded::property_cases;
 use crate::support::service::{assert_error, play};
 use endless_gym::batch::LAYOUT_VERSION;
-use endless_gym::service::{ConnectConfig, Observer, ServiceError};
+use endless_gym::service::{Observer, ServiceError};
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 use rand::rngs::SmallRng;
@@ -51,7 +51,7 @@ fn no_specification_text_makes_a_client_panic() {
                 text.splice(start..end, part);
             }
             let _published = foreign::specification_text(place.namespace(), "forged", &text);
-            let config = ConnectConfig { timeout: Duration::ZERO, ..place.connect_config("forged") };
+            let config = place.connect_config("forged").timeout(Duration::ZERO);
             // Even a valid specification has no services.
             prop_assert!(place.trainer_now("forged").is_err());
             prop_assert!(Observer::connect(&config, 0).is_err());

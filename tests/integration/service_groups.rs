@@ -148,11 +148,11 @@ fn groups_that_step_at_the_same_time_play_the_same_bytes() {
     const STEPS: usize = 150;
     let place = Place::new();
     let file = place.root().join("checkpoint");
-    let pool = PoolConfig { check_drawing: true, ..PoolConfig::new(ID, NUM_ENVS) };
+    let pool = PoolConfig::new(ID, NUM_ENVS).check_drawing(true);
     let every = Some(std::time::Duration::from_millis(5));
-    let checkpoint = Some(CheckpointConfig { every, ..CheckpointConfig::new(&file) });
+    let checkpoint = Some(CheckpointConfig::new(&file).every(every));
     let namespace = place.namespace().clone();
-    let config = EngineConfig { namespace, groups: 4, checkpoint, ..EngineConfig::new("gym", pool, 4) };
+    let config = EngineConfig::new("gym", pool, 4).namespace(namespace).groups(4).checkpoint(checkpoint);
     let mut twins = Player::new(&PoolConfig::new(ID, 4 * NUM_ENVS));
     let stop = AtomicBool::new(false);
     let saved: Vec<Vec<u64>> = std::thread::scope(|scope| {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use endless_gym::memory_gym;
 use endless_gym::pool::PoolConfig;
-use endless_gym::service::{ConnectConfig, Engine, EngineConfig, EngineStatus, Observer, Observers, Trainer};
+use endless_gym::service::{Engine, EngineStatus, Observer, Observers, Trainer};
 
 use crate::support::place::Place;
 use crate::support::process::{TIMEOUT, wait_until};
@@ -97,7 +97,7 @@ fn a_batch_wakes_an_observer_at_once() {
 #[test]
 fn dead_and_stopped_observers_hold_up_nobody() {
     let place = Place::new();
-    let config = EngineConfig { observers: 16, ..place.engine_config("gym", 2, 2) };
+    let config = place.engine_config("gym", 2, 2).observers(16);
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let mut engine = Engine::new(memory_gym(), &config).unwrap();
@@ -144,13 +144,13 @@ fn measure_the_price_of_observers() {
     let place = Place::new();
     let pool = PoolConfig::new(ID, 64);
     let namespace = place.namespace().clone();
-    let config = EngineConfig { namespace, observers: 16, ..EngineConfig::new("gym", pool, 0) };
+    let config = EngineConfig::new("gym", pool, 0).namespace(namespace).observers(16);
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let mut engine = Engine::new(memory_gym(), &config).unwrap();
         let stop = &stop;
         let running = scope.spawn(move || engine.run(stop).unwrap());
-        let connect = ConnectConfig { timeout: TIMEOUT, ..place.connect_config("gym") };
+        let connect = place.connect_config("gym").timeout(TIMEOUT);
         let mut trainer = Trainer::connect(&connect).unwrap();
         drop(reset(&mut trainer, 0));
         let rate = |trainer: &mut Trainer| {

@@ -10,7 +10,7 @@ use crate::support::process::TIMEOUT;
 use crate::support::service::{ID, reset, step};
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
-use endless_gym::service::{Engine, EngineConfig, EngineStatus, Observer, ServiceError, Trainer};
+use endless_gym::service::{Engine, EngineStatus, Observer, ServiceError, Trainer};
 
 const NUM_ENVS: usize = 4;
 
@@ -77,7 +77,7 @@ fn a_lease_is_valid_while_its_observer_is_paused() {
 #[test]
 fn a_paused_observer_keeps_its_slot() {
     let place = Place::new();
-    let config = EngineConfig { observers: 2, ..place.engine_config("gym", NUM_ENVS, 1) };
+    let config = place.engine_config("gym", NUM_ENVS, 1).observers(2);
     let mut engine = Engine::new(memory_gym(), &config).unwrap();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {

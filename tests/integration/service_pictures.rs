@@ -26,7 +26,7 @@ fn serve(place: &Place) -> Process {
 /// A pool in this process with frames, which plays as a group of the engine.
 fn twin(group: usize) -> Player {
     let (first_env, total_envs) = (group * NUM_ENVS, 2 * NUM_ENVS);
-    let mut twin = Player::new(&PoolConfig { first_env, total_envs, ..PoolConfig::new(ID, NUM_ENVS) });
+    let mut twin = Player::new(&PoolConfig::new(ID, NUM_ENVS).first_env(first_env).total_envs(total_envs));
     twin.reset(ResetRequest::Seed(3));
     twin
 }

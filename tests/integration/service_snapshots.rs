@@ -137,10 +137,9 @@ fn a_snapshot_with_a_thousand_spotlights_fits_into_a_message() {
     let place = Place::new();
     let options = serde_json::json!({"initial_spawns": 1000, "num_spawns": 1000, "spot_damage": 0.0});
     let options = ResetOptions::Shared(options.as_object().unwrap().clone());
-    let pool = PoolConfig { options, features: true, frames: None, ..PoolConfig::new("SearingSpotlights-v0", 1) };
+    let pool = PoolConfig::new("SearingSpotlights-v0", 1).options(options).features(true).frames(None);
     let config = EngineConfig::new("gym", pool, 1);
-    let mut engine =
-        Engine::new(memory_gym(), &EngineConfig { namespace: place.namespace().clone(), ..config }).unwrap();
+    let mut engine = Engine::new(memory_gym(), &config.namespace(place.namespace().clone())).unwrap();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         scope.spawn(|| engine.run(&stop).unwrap());

@@ -49,13 +49,11 @@ struct Twin {
 impl Twin {
     fn new() -> Self {
         let group = |group| {
-            let config = PoolConfig {
-                seeding: Seeding::Range { start: 0, end: 1000, step: 1, seed: Some(4) },
-                frames: Some(endless_gym::batch::Frames { stack: 3, ..Default::default() }),
-                first_env: group * NUM_ENVS,
-                total_envs: GROUPS * NUM_ENVS,
-                ..PoolConfig::new("Endless-MysteryPath-v0", NUM_ENVS)
-            };
+            let config = PoolConfig::new("Endless-MysteryPath-v0", NUM_ENVS)
+                .seeding(Seeding::Range { start: 0, end: 1000, step: 1, seed: Some(4) })
+                .frames(Some(endless_gym::batch::Frames { stack: 3, ..Default::default() }))
+                .first_env(group * NUM_ENVS)
+                .total_envs(GROUPS * NUM_ENVS);
             Player::new(&config)
         };
         Twin { groups: (0..GROUPS).map(group).collect() }

@@ -8,7 +8,7 @@ use rand::rngs::SmallRng;
 use serde_json::json;
 
 fn config(id: &str, seed: u64) -> PoolConfig {
-    PoolConfig { seeding: Seeding::Continue { seed: Some(seed) }, features: true, ..PoolConfig::new(id, 1) }
+    PoolConfig::new(id, 1).seeding(Seeding::Continue { seed: Some(seed) }).features(true)
 }
 
 #[test]
@@ -40,7 +40,7 @@ fn a_restored_environment_continues_identically() {
 fn a_snapshot_contains_the_options() {
     let id = "MortarMayhem-v0";
     let options = json!({"arena_size": 3, "agent_scale": 0.4}).as_object().unwrap().clone();
-    let original = Player::started(&PoolConfig { options: ResetOptions::Shared(options), ..config(id, 1) });
+    let original = Player::started(&config(id, 1).options(ResetOptions::Shared(options)));
     let mut restored = Player::started(&config(id, 2));
     restored.pool.restore(0, &original.pool.snapshot(0).unwrap()).unwrap();
     restored.observe();
@@ -50,7 +50,7 @@ fn a_snapshot_contains_the_options() {
 #[test]
 fn a_snapshot_contains_the_position_in_the_seeds() {
     let seeding = Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) };
-    let with_range = PoolConfig { seeding, ..config("MortarMayhem-v0", 0) };
+    let with_range = config("MortarMayhem-v0", 0).seeding(seeding);
     let mut player = Player::started(&with_range);
     let snapshot = player.pool.snapshot(0).unwrap();
     player.reset(ResetRequest::All);

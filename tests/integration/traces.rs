@@ -133,11 +133,9 @@ fn recorded_frames(id: &str) -> Vec<Vec<u8>> {
 
 /// The engine's first `count` frames when it plays a trace, with the trace's checksums.
 fn frames(trace: &Trace, count: usize) -> Vec<(Vec<u8>, u32)> {
-    let config = PoolConfig {
-        options: ResetOptions::Shared(trace.options.clone()),
-        autoreset: Autoreset::Disabled,
-        ..PoolConfig::new(&trace.env, 1)
-    };
+    let config = PoolConfig::new(&trace.env, 1)
+        .options(ResetOptions::Shared(trace.options.clone()))
+        .autoreset(Autoreset::Disabled);
     let mut player = Player::new(&config);
     let mut frames = Vec::new();
     for episode in &trace.episodes {

@@ -84,9 +84,9 @@ fn a_checkpoint_replaces_a_planted_link_and_does_not_follow_it() {
     std::fs::write(&other, "mine").unwrap();
     let plant = || symlink(&other, place.root().join("state.new")).unwrap();
     plant();
-    let checkpoint = Some(CheckpointConfig { path: path.clone(), every: None, resume: false });
+    let checkpoint = Some(CheckpointConfig::new(&path));
     let config = EngineConfig::new("gym", PoolConfig::new("MysteryPath-Grid-v0", 1), 1);
-    let config = EngineConfig { checkpoint, namespace: place.namespace().clone(), ..config };
+    let config = config.checkpoint(checkpoint).namespace(place.namespace().clone());
     let mut engine = Engine::new(memory_gym(), &config).unwrap();
     plant();
     let stop = std::sync::atomic::AtomicBool::new(false);

@@ -90,7 +90,7 @@ fn frames_equal_the_bytes_of_the_batch_in_every_format() {
         socket.select(0, &envs);
         // A page shows only batches sent after its server has connected.
         socket.wait(|about| about["state"] == "live");
-        let config = PoolConfig { frames: Some(Frames { format, stack }), ..PoolConfig::new(id, 5) };
+        let config = PoolConfig::new(id, 5).frames(Some(Frames { format, stack }));
         // The second twin plays the same episode with frames as [x][y][channel].
         let mut twins = [Player::new(&config), Player::new(&PoolConfig::new(id, 5))];
         reset(&mut trainer, 0);

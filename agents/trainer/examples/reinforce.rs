@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
     let updates = arguments.next().map_or(Ok(200), |number| number.parse::<usize>())?;
     let engine = arguments.next().unwrap_or_else(|| "endless".to_owned());
-    let mut trainer = Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(&engine) })?;
+    let mut trainer = Trainer::connect(&ConnectConfig::new(&engine).timeout(TIMEOUT))?;
     let (n, features) = (trainer.specification().num_envs, trainer.specification().features.len());
     let choices = [trainer.specification().action_space.branches()[0] as usize];
     let (rows, mut random) = (STEPS * n, Generator::from_seed(1));

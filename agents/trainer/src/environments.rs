@@ -52,14 +52,12 @@ pub fn pool_config(registry: &Registry, settings: &Settings) -> Result<PoolConfi
     let wanted = &settings.environment;
     let num_envs = wanted.num_envs / wanted.groups;
     let seeding = Seeding::Range { start: 0, end: TRAINING_SEEDS, step: 1, seed: Some(settings.seed) };
-    let config = PoolConfig {
-        options: ResetOptions::Shared(settings.options()?),
-        autoreset: Autoreset::SameStep,
-        seeding,
-        frames: None,
-        features: true,
-        ..PoolConfig::new(spec.id, num_envs)
-    };
+    let config = PoolConfig::new(spec.id, num_envs)
+        .options(ResetOptions::Shared(settings.options()?))
+        .autoreset(Autoreset::SameStep)
+        .seeding(seeding)
+        .frames(None)
+        .features(true);
     config.validate(spec)?;
     Ok(config)
 }
@@ -75,7 +73,7 @@ impl Environments {
         let threads = Threads::new(wanted.num_threads)?;
         let pool = |group| {
             let first_env = group * config.num_envs;
-            let config = PoolConfig { first_env, total_envs: wanted.num_envs, ..config.clone() };
+            let config = config.clone().first_env(first_env).total_envs(wanted.num_envs);
             let pool = Pool::new(registry, &config, &threads)?;
             let buffer = BatchBuffer::new(pool.layout().blocks());
             Ok((pool, buffer))

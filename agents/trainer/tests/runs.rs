@@ -9,7 +9,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::{Args, Command, FromArgMatches};
-use endless_gym_core::pool::PoolConfig;
 use endless_gym_core::random::Generator;
 use endless_gym_kernels::network::{Network, Pass};
 use endless_gym_kernels::sequences::Sequences;
@@ -223,19 +222,15 @@ fn a_run_with_an_engine_is_the_same_as_in_process() {
     let arguments = format!("{SMALL} --run {}/served --environment.groups 2", folder.0.display());
     let settings = settings(&arguments);
     let pool = pool_config(memory_gym(), &settings).unwrap();
-    let config = EngineConfig { groups: 2, namespace: namespace.clone(), ..EngineConfig::new("learn", pool, 1) };
-    let wrong = EngineConfig {
-        service: "wrong".to_owned(),
-        pool: PoolConfig { features: false, ..config.pool.clone() },
-        ..config.clone()
-    };
+    let config = EngineConfig::new("learn", pool, 1).groups(2).namespace(namespace.clone());
+    let wrong = config.clone().service("wrong".to_owned()).pool(config.pool.clone().features(false));
     let (mut engine, _wrong) =
         (Engine::new(memory_gym(), &config).unwrap(), Engine::new(memory_gym(), &wrong).unwrap());
     let stop = AtomicBool::new(false);
     let run = std::thread::scope(|scope| {
         let running = scope.spawn(|| engine.run(&stop));
-        let connect = ConnectConfig { namespace, timeout: Duration::from_secs(10), ..ConnectConfig::new("learn") };
-        let other = Trainer::connect(&ConnectConfig { service: "wrong".to_owned(), ..connect.clone() }).unwrap();
+        let connect = ConnectConfig::new("learn").namespace(namespace).timeout(Duration::from_secs(10));
+        let other = Trainer::connect(&connect.clone().service("wrong".to_owned())).unwrap();
         let error = Environments::served(memory_gym(), &settings, other).err().unwrap().to_string();
         assert!(error.contains("same_step and 0 features"), "{error}");
         let connected = Trainer::connect(&connect);

@@ -82,7 +82,7 @@ impl Connection {
     fn new(py: Python<'_>, service: &str, timeout: f64) -> PyResult<Self> {
         logs::start(py)?;
         let config = ConnectConfig::new(service);
-        let connect = |slice| Trainer::connect(&ConnectConfig { timeout: slice, ..config.clone() });
+        let connect = |slice| Trainer::connect(&config.clone().timeout(slice));
         let trainer = wait_for_engine(py, timeout, connect)?;
         logs::flush(py)?;
         let specification = trainer.specification();

@@ -28,7 +28,7 @@ impl Observer {
     fn new(py: Python<'_>, service: &str, group: Option<usize>, timeout: f64) -> PyResult<Self> {
         logs::start(py)?;
         let config = ConnectConfig::new(service);
-        let connect = |slice| Observers::connect(&ConnectConfig { timeout: slice, ..config.clone() }, group);
+        let connect = |slice| Observers::connect(&config.clone().timeout(slice), group);
         let observers = wait_for_engine(py, timeout, connect)?;
         logs::flush(py)?;
         Ok(Observer { observers, process: std::process::id() })

@@ -63,13 +63,11 @@ impl Game {
         seed: Option<u64>,
         script: Option<(Trace, usize)>,
     ) -> Result<Self, WebError> {
-        let config = PoolConfig {
-            options: ResetOptions::Shared(options.clone()),
-            autoreset: Autoreset::Disabled,
-            seeding: Seeding::Continue { seed: Some(0) },
-            features: !registry.spec(id)?.features.is_empty(),
-            ..PoolConfig::new(id, 1)
-        };
+        let config = PoolConfig::new(id, 1)
+            .options(ResetOptions::Shared(options.clone()))
+            .autoreset(Autoreset::Disabled)
+            .seeding(Seeding::Continue { seed: Some(0) })
+            .features(!registry.spec(id)?.features.is_empty());
         let pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let blocks = zeroed(pool.layout().blocks());
         let rgba = pool.spec().frame.map_or(0, |frame| frame.width * frame.height * 4);

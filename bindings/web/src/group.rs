@@ -42,13 +42,10 @@ impl Group {
     ) -> Result<Self, WebError> {
         let spec = registry.spec(id)?;
         let shape = spec.frame.ok_or(WebError::NoFrame { id: spec.id })?;
-        let config = PoolConfig {
-            options: ResetOptions::Shared(options),
-            // Each episode has a seed of its own, so that it can be played alone.
-            seeding: Seeding::Range { start: 0, end: SEEDS, step: 1, seed: Some(seed) },
-            features: expert,
-            ..PoolConfig::new(id, num_envs)
-        };
+        // Each episode has its own seed, so that it can be played alone.
+        let seeding = Seeding::Range { start: 0, end: SEEDS, step: 1, seed: Some(seed) };
+        let options = ResetOptions::Shared(options);
+        let config = PoolConfig::new(id, num_envs).options(options).seeding(seeding).features(expert);
         let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;

@@ -92,7 +92,7 @@ impl Request {
             }
             Request::Check { id, options } => {
                 let options = ResetOptions::Shared(parse(&options));
-                PoolConfig { options, ..PoolConfig::new(&id, 1) }.validate(app.registry.spec(&id)?)?;
+                PoolConfig::new(&id, 1).options(options).validate(app.registry.spec(&id)?)?;
                 return Ok(Reply::Json(Json::Null));
             }
             Request::Start { id, options, seed } => {

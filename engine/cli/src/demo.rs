@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::pool::{Autoreset, Experts, PoolConfig, Registry, ResetRequest};
+use endless_gym_core::pool::{Autoreset, Experts, Registry, ResetRequest};
 use endless_gym_service::EngineConfig;
 use serde_json::{Map, Value as Json, json};
 
@@ -71,8 +71,8 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
         Policy::Expert => 64,
         Policy::Random => 512,
     });
-    let pool = PoolConfig { features: true, ..args.environment.configure(&args.id, num_envs)? };
-    let config = EngineConfig { groups: args.groups, ..EngineConfig::new("endless", pool, args.threads) };
+    let pool = args.environment.configure(&args.id, num_envs)?.features(true);
+    let config = EngineConfig::new("endless", pool, args.threads).groups(args.groups);
     let mut engine = EngineProcess::start(config)?;
     let mut trainer = engine.connect(stop)?;
     let _view = if args.view { Some(Beside::start(engine.service(), args.open)?) } else { None };

@@ -67,7 +67,7 @@ impl EngineProcess {
         let mut engine = Self::spawn(command, ConnectConfig::new(&service))?;
         if let Some(stdin) = &mut engine.child.stdin {
             // On an error the engine has ended, which `connect` reports with the engine's message.
-            let _ = serde_json::to_writer(stdin, &EngineConfig { service, ..config });
+            let _ = serde_json::to_writer(stdin, &config.service(service));
         }
         Ok(engine)
     }
@@ -86,7 +86,7 @@ impl EngineProcess {
         let stderr = stderr.inspect_err(|_| {
             let _ = child.kill().and_then(|()| child.wait());
         })?;
-        let config = ConnectConfig { timeout: POLL_INTERVAL, ..config };
+        let config = config.timeout(POLL_INTERVAL);
         Ok(EngineProcess { child, stderr, config })
     }
 
@@ -173,7 +173,7 @@ mod tests {
     /// The error of connecting to a shell script instead of an engine.
     fn error(name: &str, script: &str, timeout: Duration, stop: bool) -> String {
         let root = format!("/tmp/endless-child-{name}-{}", std::process::id());
-        let config = ConnectConfig { namespace: Namespace::at(&root), ..ConnectConfig::new("gym") };
+        let config = ConnectConfig::new("gym").namespace(Namespace::at(&root));
         let mut command = Command::new("sh");
         command.args(["-c", script]);
         let mut engine = EngineProcess::spawn(command, config).unwrap();

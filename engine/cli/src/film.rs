@@ -35,7 +35,7 @@ impl Film {
         action_seed: u64,
     ) -> Result<Self, Failure> {
         let frames = Some(Frames::default());
-        let config = PoolConfig { num_envs: 1, total_envs: 1, features: true, frames, ..config.clone() };
+        let config = config.clone().num_envs(1).total_envs(1).features(true).frames(frames);
         let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;

@@ -22,13 +22,13 @@ pub fn run(registry: &Registry, settings: &Settings) -> Result<(), Failure> {
     // Ends after the trainer.
     let mut engine = None;
     let trainer = if !settings.connect.is_empty() {
-        let config = ConnectConfig { timeout: CONNECT_TIMEOUT, ..ConnectConfig::new(&settings.connect) };
+        let config = ConnectConfig::new(&settings.connect).timeout(CONNECT_TIMEOUT);
         let trainer = Trainer::connect(&config)?;
         settings = settings.of_engine(trainer.specification())?;
         Some(trainer)
     } else if settings.environment.engine == Place::Process {
         let (pool, wanted) = (pool_config(registry, &settings)?, &settings.environment);
-        let config = EngineConfig { groups: wanted.groups, ..EngineConfig::new("endless", pool, wanted.num_threads) };
+        let config = EngineConfig::new("endless", pool, wanted.num_threads).groups(wanted.groups);
         Some(engine.insert(EngineProcess::start(config)?).connect(stop)?)
     } else {
         None

@@ -109,7 +109,12 @@ impl EnvironmentArgs {
         let EnvironmentArgs { independent_episodes, first_env, .. } = *self;
         let total_envs = self.total_envs.unwrap_or(first_env.saturating_add(num_envs));
         let new = PoolConfig::new(id, num_envs);
-        Ok(PoolConfig { options, seeding, independent_episodes, first_env, total_envs, ..new })
+        Ok(new
+            .options(options)
+            .seeding(seeding)
+            .independent_episodes(independent_episodes)
+            .first_env(first_env)
+            .total_envs(total_envs))
     }
 }
 

@@ -55,7 +55,7 @@ const TYPICAL_STEP: usize = 12;
 /// The ground-truth view at a typical step of an episode, in 42 columns and 22 lines; next to the observation if 86
 /// columns are available. The expert plays the episode, or random actions if there is no expert.
 pub fn picture(registry: &Registry, spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
-    let config = PoolConfig { seeding: Seeding::Continue { seed: Some(SEED) }, ..PoolConfig::new(spec.id, 1) };
+    let config = PoolConfig::new(spec.id, 1).seeding(Seeding::Continue { seed: Some(SEED) });
     let policy = if registry.expert(spec.id).is_ok() { Policy::Expert } else { Policy::Random };
     let mut film = Film::played_by(registry, &config, policy, 0)?;
     for _ in 0..TYPICAL_STEP {

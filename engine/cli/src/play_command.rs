@@ -45,7 +45,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
         return terminal::play::run(registry, &args.id, options, args.seed.unwrap_or(0), &args.terminal);
     }
     let spec = registry.spec(&args.id)?;
-    PoolConfig { options: ResetOptions::Shared(options.clone()), ..PoolConfig::new(spec.id, 1) }.validate(spec)?;
+    PoolConfig::new(spec.id, 1).options(ResetOptions::Shared(options.clone())).validate(spec)?;
     let stop = stop::on_signal()?;
     let server = PlayServer::bind(args.page.port, spec.id)?;
     let url = server.url(spec.id, &options, args.seed);

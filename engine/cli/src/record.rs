@@ -87,11 +87,9 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
 impl FilmArgs {
     /// The start of an episode.
     fn start(&self, registry: &Registry, episode: u64) -> Result<Film, Failure> {
-        let config = PoolConfig {
-            options: ResetOptions::Shared(parameters(&self.options)?),
-            seeding: Seeding::Continue { seed: Some(self.seed.wrapping_add(episode)) },
-            ..PoolConfig::new(&self.id, 1)
-        };
+        let config = PoolConfig::new(&self.id, 1)
+            .options(ResetOptions::Shared(parameters(&self.options)?))
+            .seeding(Seeding::Continue { seed: Some(self.seed.wrapping_add(episode)) });
         Film::played_by(registry, &config, self.policy, self.action_seed.wrapping_add(episode))
     }
 

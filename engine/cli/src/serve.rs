@@ -7,7 +7,7 @@ use std::thread;
 use std::time::Duration;
 
 use endless_gym_core::files;
-use endless_gym_core::pool::{Autoreset, PoolConfig, Registry};
+use endless_gym_core::pool::{Autoreset, Registry};
 use endless_gym_service::{CheckpointConfig, Engine, EngineActivity, EngineConfig, EngineMonitor, ServiceError};
 use endless_gym_view::MetricsServer;
 use serde::Deserialize;
@@ -100,17 +100,20 @@ struct EngineArgs {
 
 impl EngineArgs {
     fn configure(&self) -> Result<EngineConfig, Failure> {
-        let pool = PoolConfig {
-            autoreset: self.autoreset,
-            final_observation: self.final_observation,
-            frames: self.frames.frames(),
-            features: self.features,
-            ..self.environment.configure(&self.id, self.num_envs)?
-        };
+        let pool = self
+            .environment
+            .configure(&self.id, self.num_envs)?
+            .autoreset(self.autoreset)
+            .final_observation(self.final_observation)
+            .frames(self.frames.frames())
+            .features(self.features);
         let checkpoint =
-            self.checkpoint.clone().map(|path| CheckpointConfig { path, every: self.every, resume: self.resume });
+            self.checkpoint.clone().map(|path| CheckpointConfig::new(path).every(self.every).resume(self.resume));
         let (groups, batches_held) = (self.groups, self.batches_held);
-        Ok(EngineConfig { checkpoint, groups, batches_held, ..EngineConfig::new(&self.service, pool, self.threads) })
+        Ok(EngineConfig::new(&self.service, pool, self.threads)
+            .checkpoint(checkpoint)
+            .groups(groups)
+            .batches_held(batches_held))
     }
 }
 

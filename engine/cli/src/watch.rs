@@ -147,7 +147,7 @@ pub fn connect(
     let start = Instant::now();
     loop {
         let left = timeout.saturating_sub(start.elapsed());
-        let config = ConnectConfig { timeout: left.min(SLICE), ..ConnectConfig::new(service) };
+        let config = ConnectConfig::new(service).timeout(left.min(SLICE));
         match Observers::connect(&config, group) {
             Err(
                 ServiceError::UnknownEngine { .. }

@@ -190,7 +190,7 @@ fn text(error: impl std::error::Error) -> String {
 /// All that an environment can write, with fixed seeds.
 fn config(spec: &EnvSpec, num_envs: usize) -> PoolConfig {
     let seeding = Seeding::Continue { seed: Some(0) };
-    PoolConfig { features: !spec.features.is_empty(), seeding, ..PoolConfig::new(spec.id, num_envs) }
+    PoolConfig::new(spec.id, num_envs).features(!spec.features.is_empty()).seeding(seeding)
 }
 
 /// Fails at the first step after which two games differ.
@@ -257,7 +257,7 @@ fn is_alone(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
 fn snapshots_continue(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
     use Autoreset::{Disabled, NextStep};
     for (start, autoreset) in [(0, NextStep), (1, NextStep), (7, NextStep), (40, NextStep), (STEPS, Disabled)] {
-        let config = PoolConfig { autoreset, ..config(spec, 1) };
+        let config = config(spec, 1).autoreset(autoreset);
         let mut game = Game::started(registry, &config, 11 + start as u64)?;
         let mut other = Game::started(registry, &config, 500)?;
         game.play(start)?;
@@ -282,7 +282,7 @@ fn repaints(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
             row_major: bits == 2,
         };
         let frames = Some(Frames { format, stack });
-        let config = PoolConfig { frames, check_drawing: true, ..config(spec, NUM_ENVS) };
+        let config = config(spec, NUM_ENVS).frames(frames).check_drawing(true);
         Game::started(registry, &config, 13)?.play(STEPS)?;
     }
     Ok(())
@@ -385,11 +385,7 @@ fn limits_are_playable(registry: &Registry, spec: &EnvSpec) -> Result<(), String
     for parameter in spec.parameters {
         for value in limits(parameter) {
             let options: OptionMap = Map::from_iter([(parameter.name.to_owned(), value.clone())]);
-            let config = PoolConfig {
-                options: ResetOptions::Shared(options),
-                autoreset: Autoreset::SameStep,
-                ..config(spec, NUM_ENVS)
-            };
+            let config = config(spec, NUM_ENVS).options(ResetOptions::Shared(options)).autoreset(Autoreset::SameStep);
             let play = || {
                 let mut game = Game::started(registry, &config, 23)?;
                 (0..STEPS / 8).try_for_each(|_| game.play(1).and_then(|_| game.reload()))

@@ -16,7 +16,7 @@ fn main() {
     let id = std::env::args().nth(1).unwrap_or_default();
     // A plain `cargo bench` passes no id.
     let Ok(spec) = memory_gym().spec(&id) else { return };
-    let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, NUM_ENVS) };
+    let config = PoolConfig::new(spec.id, NUM_ENVS).seeding(Seeding::Continue { seed: Some(1) });
     let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
     let mut batch = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut batch).unwrap();

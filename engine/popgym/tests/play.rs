@@ -15,7 +15,7 @@ impl Player {
     /// Environments whose first episodes have seeds from `seed` on.
     fn new(id: &str, num_envs: usize, threads: usize, seed: u64) -> Self {
         let seeding = Seeding::Continue { seed: Some(1) };
-        let config = PoolConfig { features: true, frames: None, seeding, ..PoolConfig::new(id, num_envs) };
+        let config = PoolConfig::new(id, num_envs).features(true).frames(None).seeding(seeding);
         let pool = Pool::new(popgym(), &config, &Threads::new(threads).unwrap()).unwrap();
         let blocks = zeroed(pool.layout().blocks());
         let mut player = Player { pool, blocks };

@@ -98,7 +98,7 @@ struct Observation {
 impl Observation {
     fn connect(channel: &Channel) -> Result<Self, ServiceError> {
         let (service, namespace) = (channel.service.clone(), channel.namespace.clone());
-        let config = ConnectConfig { service, namespace, timeout: Duration::ZERO };
+        let config = ConnectConfig::new(&service).namespace(namespace);
         let first = Observer::connect(&config, 0)?;
         let specification = Arc::new(first.specification().clone());
         let mut groups = vec![WatchedGroup::new(first)];

@@ -44,7 +44,7 @@ pub fn observe(habit: &Habit) {
     let mut groups = 1;
     while !must_stop() {
         let group = draws.integers(0, groups as i64) as usize;
-        let config = ConnectConfig { timeout: PATIENCE, ..ConnectConfig::new(SERVICE) };
+        let config = ConnectConfig::new(SERVICE).timeout(PATIENCE);
         Event::Connecting { at: now() }.report();
         let mut observer = match Observer::connect(&config, group) {
             Ok(observer) => observer,
@@ -104,7 +104,7 @@ pub fn visit(seed: u64, times: usize) {
             Event::error("list", &error, None).report();
         }
         if draws.integers(0, 8) == 0 {
-            let config = ConnectConfig { timeout: Duration::ZERO, ..ConnectConfig::new(SERVICE) };
+            let config = ConnectConfig::new(SERVICE).timeout(Duration::ZERO);
             match Trainer::connect(&config) {
                 // The trainer has just died, or has not started yet.
                 Ok(trainer) => drop(trainer),
@@ -122,7 +122,7 @@ pub fn intrude() {
     if running_engines(&namespace).is_ok_and(|engines| !engines.is_empty()) {
         Event::Broken { what: "another user sees the engine".to_owned() }.report();
     }
-    let config = ConnectConfig { timeout: Duration::ZERO, ..ConnectConfig::new(SERVICE) };
+    let config = ConnectConfig::new(SERVICE).timeout(Duration::ZERO);
     if Trainer::connect(&config).is_ok() || Observer::connect(&config, 0).is_ok() {
         Event::Broken { what: "another user can connect".to_owned() }.report();
     }

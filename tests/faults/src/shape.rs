@@ -88,16 +88,14 @@ impl Shape {
 
     /// The pool that plays the same as the engine's group.
     pub fn pool(&self, group: usize) -> PoolConfig {
-        PoolConfig {
-            options: ResetOptions::Shared(self.options.clone()),
-            autoreset: self.autoreset,
-            final_observation: self.final_observation,
-            seeding: Seeding::Continue { seed: self.seed },
-            frames: self.frames,
-            features: self.features,
-            first_env: group * self.num_envs,
-            total_envs: self.groups * self.num_envs,
-            ..PoolConfig::new(&self.id, self.num_envs)
-        }
+        PoolConfig::new(&self.id, self.num_envs)
+            .options(ResetOptions::Shared(self.options.clone()))
+            .autoreset(self.autoreset)
+            .final_observation(self.final_observation)
+            .seeding(Seeding::Continue { seed: self.seed })
+            .frames(self.frames)
+            .features(self.features)
+            .first_env(group * self.num_envs)
+            .total_envs(self.groups * self.num_envs)
     }
 }

@@ -106,7 +106,7 @@ struct Requested {
 }
 
 fn connect() -> Option<Trainer> {
-    let config = ConnectConfig { timeout: PATIENCE, ..ConnectConfig::new(SERVICE) };
+    let config = ConnectConfig::new(SERVICE).timeout(PATIENCE);
     Event::Connecting { at: now() }.report();
     Trainer::connect(&config).inspect_err(|error| Event::error("connect", error, None).report()).ok()
 }

@@ -13,7 +13,7 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let spec = playing::spec(input)?;
     let frames = Some(Frames { stack: input.int_in_range(1..=4)?, ..Frames::default() });
     let seeding = Seeding::Continue { seed: Some(3) };
-    let config = PoolConfig { frames, seeding, check_drawing: true, ..PoolConfig::new(spec.id, ENVS) };
+    let config = PoolConfig::new(spec.id, ENVS).frames(frames).seeding(seeding).check_drawing(true);
     let pool =
         || Pool::new(playing::registry(), &config, &Threads::new(1).expect("one thread")).expect("defaults are valid");
     let mut saving = pool();

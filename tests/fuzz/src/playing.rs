@@ -26,15 +26,13 @@ pub(crate) fn spec(input: &mut Unstructured<'_>) -> Result<&'static EnvSpec> {
 
 /// A pool with everything that a batch can contain, which draws each frame twice and compares the two.
 pub(crate) fn pool(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> std::result::Result<Pool, PoolError> {
-    let config = PoolConfig {
-        seeding: Seeding::Continue { seed: Some(3) },
-        options: ResetOptions::Shared(options),
-        autoreset,
-        final_observation: autoreset == Autoreset::SameStep,
-        features: true,
-        check_drawing: true,
-        ..PoolConfig::new(spec.id, 1)
-    };
+    let config = PoolConfig::new(spec.id, 1)
+        .seeding(Seeding::Continue { seed: Some(3) })
+        .options(ResetOptions::Shared(options))
+        .autoreset(autoreset)
+        .final_observation(autoreset == Autoreset::SameStep)
+        .features(true)
+        .check_drawing(true);
     Pool::new(registry(), &config, &Threads::new(1)?)
 }
 

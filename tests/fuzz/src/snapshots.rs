@@ -113,14 +113,12 @@ impl Game {
     ///
     /// If the options are not valid.
     pub fn new(spec: &'static EnvSpec, seeding: Seeding, options: Map<String, Json>) -> Self {
-        let config = PoolConfig {
-            seeding,
-            options: ResetOptions::Shared(options),
-            autoreset: Autoreset::SameStep,
-            final_observation: true,
-            features: true,
-            ..PoolConfig::new(spec.id, 1)
-        };
+        let config = PoolConfig::new(spec.id, 1)
+            .seeding(seeding)
+            .options(ResetOptions::Shared(options))
+            .autoreset(Autoreset::SameStep)
+            .final_observation(true)
+            .features(true);
         let mut pool = Pool::new(playing::registry(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();

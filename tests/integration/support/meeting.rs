@@ -79,5 +79,5 @@ pub fn registry() -> Registry {
 
 /// The configuration of a group.
 pub fn pool(num_envs: usize) -> PoolConfig {
-    PoolConfig { features: true, frames: None, ..PoolConfig::new(ID, num_envs) }
+    PoolConfig::new(ID, num_envs).features(true).frames(None)
 }

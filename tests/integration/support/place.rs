@@ -79,7 +79,7 @@ impl Place {
     }
 
     pub fn connect_config(&self, service: &str) -> ConnectConfig {
-        ConnectConfig { namespace: self.namespace.clone(), timeout: TIMEOUT, ..ConnectConfig::new(service) }
+        ConnectConfig::new(service).namespace(self.namespace.clone()).timeout(TIMEOUT)
     }
 
     /// Connects to an engine; waits for it to start.
@@ -89,7 +89,7 @@ impl Place {
 
     /// Connects to an engine that must be running.
     pub fn trainer_now(&self, service: &str) -> Result<Trainer, ServiceError> {
-        Trainer::connect(&ConnectConfig { namespace: self.namespace.clone(), ..ConnectConfig::new(service) })
+        Trainer::connect(&ConnectConfig::new(service).namespace(self.namespace.clone()))
     }
 
     /// The shared memory segments.

@@ -48,8 +48,8 @@ pub fn set_role(command: &mut Command, role: &str) {
 }
 
 fn engine_config(namespace: &Namespace, service: &str, num_envs: usize, groups: usize) -> EngineConfig {
-    let pool = PoolConfig { check_drawing: true, ..PoolConfig::new(ID, num_envs) };
-    EngineConfig { namespace: namespace.clone(), groups, ..EngineConfig::new(service, pool, 1) }
+    let pool = PoolConfig::new(ID, num_envs).check_drawing(true);
+    EngineConfig::new(service, pool, 1).namespace(namespace.clone()).groups(groups)
 }
 
 /// Resets a group with seed 3, and returns its first batch.
@@ -104,8 +104,7 @@ pub fn assert_rejected<T>(result: Result<T, ServiceError>, expected: Rejection, 
 /// Plays the role that the environment variable names, if any.
 pub fn play_role() {
     let Ok(role) = std::env::var(ROLE) else { return };
-    let connect =
-        |service| Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(service) }).unwrap();
+    let connect = |service| Trainer::connect(&ConnectConfig::new(service).timeout(TIMEOUT)).unwrap();
     match role.split(' ').collect::<Vec<_>>()[..] {
         ["engine", service, num_envs, groups] => {
             let (num_envs, groups) = (num_envs.parse().unwrap(), groups.parse().unwrap());
@@ -115,7 +114,7 @@ pub fn play_role() {
         }
         ["meeting", num_envs, groups, threads] => {
             let (pool, groups) = (meeting::pool(num_envs.parse().unwrap()), groups.parse().unwrap());
-            let config = EngineConfig { groups, ..EngineConfig::new("meeting", pool, threads.parse().unwrap()) };
+            let config = EngineConfig::new("meeting", pool, threads.parse().unwrap()).groups(groups);
             let mut engine = Engine::new(&meeting::registry(), &config).unwrap();
             engine.run(&stop_at_end_of_input()).unwrap();
         }
@@ -138,7 +137,7 @@ pub fn play_role() {
         ["faulty", ref arguments @ ..] => faulty_environments::program(arguments),
         ["stuck", "trainer"] => faulty_environments::stuck_trainer(),
         ["observer", service] => {
-            let config = ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(service) };
+            let config = ConnectConfig::new(service).timeout(TIMEOUT);
             let mut observers = Observers::connect(&config, None).unwrap();
             loop {
                 observers.next(TIMEOUT).unwrap();

@@ -102,7 +102,7 @@ fn a_checkpoint_of_the_trainer_plays_as_in_the_trainer() {
         let mut trained = network::new(&settings, page.network.spec.observation_width, vec![4], &mut random);
         Checkpoint::read(&run).unwrap().start(&mut trained).unwrap();
         // An episode in which the page plays; the trainer's network computes all of its steps at once.
-        let config = PoolConfig { features: true, frames: None, ..PoolConfig::new("MortarMayhem-Grid-v0", 1) };
+        let config = PoolConfig::new("MortarMayhem-Grid-v0", 1).features(true).frames(None);
         let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut buffer = BatchBuffer::new(pool.layout().blocks());
         pool.reset(ResetRequest::Seed(5), &mut buffer).unwrap();

@@ -33,7 +33,7 @@ mod tests {
     use super::*;
 
     fn observed(frames: Frames) -> Pixels {
-        let config = PoolConfig { frames: Some(frames), ..PoolConfig::new("SearingSpotlights-v0", 1) };
+        let config = PoolConfig::new("SearingSpotlights-v0", 1).frames(Some(frames));
         let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::Seed(2), &mut blocks).unwrap();

@@ -23,12 +23,10 @@ pub struct Game {
 impl Game {
     /// Starts an episode.
     pub fn start(registry: &Registry, id: &str, options: OptionMap, seed: u64) -> Result<Self, Failure> {
-        let config = PoolConfig {
-            options: ResetOptions::Shared(options.clone()),
-            autoreset: Autoreset::Disabled,
-            seeding: Seeding::Continue { seed: Some(seed) },
-            ..PoolConfig::new(id, 1)
-        };
+        let config = PoolConfig::new(id, 1)
+            .options(ResetOptions::Shared(options.clone()))
+            .autoreset(Autoreset::Disabled)
+            .seeding(Seeding::Continue { seed: Some(seed) });
         let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;

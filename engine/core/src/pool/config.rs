@@ -47,7 +47,23 @@ impl TryFrom<Json> for ResetOptions {
     }
 }
 
-/// Configuration of a pool.
+/// Defines a method for each field of a configuration, which returns the configuration with another value of the field.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! setters {
+    ($($field:ident: $type:ty),+ $(,)?) => {
+        $(
+            #[doc = concat!("With [`", stringify!($field), "`](Self#structfield.", stringify!($field), ").")]
+            #[must_use]
+            pub fn $field(mut self, $field: $type) -> Self {
+                self.$field = $field;
+                self
+            }
+        )+
+    };
+}
+
+/// Configuration of a pool: [`new`](Self::new) has the defaults, and a method for each field changes one.
 ///
 /// In JSON, the keys are the names of the fields. Only `id` and `num_envs` are required; the other fields default to those of
 /// [`new`](Self::new), and an unknown field is an error. `"frames": null` omits the frames.
@@ -71,6 +87,7 @@ impl TryFrom<Json> for ResetOptions {
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(remote = "Self", deny_unknown_fields)]
+#[non_exhaustive]
 pub struct PoolConfig {
     /// Environment id, such as `MortarMayhem-v0`.
     pub id: String,
@@ -157,6 +174,20 @@ impl PoolConfig {
             first_env: 0,
             total_envs: num_envs,
         }
+    }
+
+    setters! {
+        num_envs: usize,
+        options: ResetOptions,
+        autoreset: Autoreset,
+        final_observation: bool,
+        seeding: Seeding,
+        independent_episodes: bool,
+        frames: Option<Frames>,
+        features: bool,
+        check_drawing: bool,
+        first_env: usize,
+        total_envs: usize,
     }
 
     /// Checks everything that [`Pool::new`](super::Pool::new) checks, without creating environments. `spec` is the
@@ -269,21 +300,20 @@ mod tests {
     fn every_field_survives_json() {
         let options = |text| serde_json::from_str::<OptionMap>(text).unwrap();
         let new = PoolConfig::new("MysteryPath-v0", 2);
-        let all = PoolConfig {
-            options: ResetOptions::Each(vec![options(r#"{"agent_scale": 0.2}"#), options("{}")]),
-            autoreset: Autoreset::Disabled,
-            final_observation: true,
-            seeding: Seeding::Range { start: 1, end: 9, step: 2, seed: Some(u64::MAX) },
-            independent_episodes: true,
-            frames: Some(Frames { format: PixelFormat { grayscale: true, ..PixelFormat::default() }, stack: 4 }),
-            features: true,
-            check_drawing: true,
-            first_env: 3,
-            total_envs: 7,
-            ..new.clone()
-        };
-        let list = PoolConfig { seeding: Seeding::List(vec![3, 1]), frames: None, ..new.clone() };
-        let seeded = PoolConfig { seeding: Seeding::Continue { seed: Some(5) }, ..new.clone() };
+        let all = new
+            .clone()
+            .options(ResetOptions::Each(vec![options(r#"{"agent_scale": 0.2}"#), options("{}")]))
+            .autoreset(Autoreset::Disabled)
+            .final_observation(true)
+            .seeding(Seeding::Range { start: 1, end: 9, step: 2, seed: Some(u64::MAX) })
+            .independent_episodes(true)
+            .frames(Some(Frames { format: PixelFormat { grayscale: true, ..PixelFormat::default() }, stack: 4 }))
+            .features(true)
+            .check_drawing(true)
+            .first_env(3)
+            .total_envs(7);
+        let list = new.clone().seeding(Seeding::List(vec![3, 1])).frames(None);
+        let seeded = new.clone().seeding(Seeding::Continue { seed: Some(5) });
         for config in [new.clone(), all, list, seeded] {
             let text = serde_json::to_string(&config).unwrap();
             assert_eq!(serde_json::from_str::<PoolConfig>(&text).unwrap(), config, "{text}");

@@ -15,7 +15,7 @@ use crate::envs::{Expert, UnknownEnvironment};
 /// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::pool::{Experts, Pool, PoolConfig, ResetRequest, Threads};
 ///
-/// let config = PoolConfig { features: true, ..PoolConfig::new("MortarMayhem-Grid-v0", 4) };
+/// let config = PoolConfig::new("MortarMayhem-Grid-v0", 4).features(true);
 /// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
 /// let mut experts = Experts::new(memory_gym(), &config.id, 4, config.autoreset)?;
 /// let (mut blocks, mut actions) = (zeroed(pool.layout().blocks()), [0; 4]);

@@ -392,7 +392,7 @@ impl Pool {
     /// # use endless_gym_core::batch::zeroed;
     /// # use endless_gym_memory_gym::memory_gym;
     /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
-    /// let config = PoolConfig { features: true, frames: None, ..PoolConfig::new("MysteryPath-v0", 2) };
+    /// let config = PoolConfig::new("MysteryPath-v0", 2).features(true).frames(None);
     /// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
     /// pool.reset(ResetRequest::Seed(3), &mut zeroed(pool.layout().blocks()))?;
     /// assert_eq!(pool.frame(1)?.len(), 84 * 84 * 3);

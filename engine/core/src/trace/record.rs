@@ -19,7 +19,7 @@ use crate::pool::{OptionMap, Pool};
 /// use endless_gym_core::pool::{Autoreset, Pool, PoolConfig, ResetRequest, Threads};
 /// use endless_gym_core::trace::{Recorder, Trace, replay};
 ///
-/// let config = PoolConfig { autoreset: Autoreset::Disabled, ..PoolConfig::new("MysteryPath-v0", 1) };
+/// let config = PoolConfig::new("MysteryPath-v0", 1).autoreset(Autoreset::Disabled);
 /// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// let mut recorder = Recorder::new("MysteryPath-v0", &Default::default());

@@ -82,14 +82,12 @@ impl Replay {
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> {
-    let config = PoolConfig {
-        options: ResetOptions::Shared(trace.options.clone()),
-        autoreset: Autoreset::Disabled,
-        check_drawing: true,
+    let config = PoolConfig::new(&trace.env, 1)
+        .options(ResetOptions::Shared(trace.options.clone()))
+        .autoreset(Autoreset::Disabled)
+        .check_drawing(true)
         // Only used by a first episode without a seed, since not every platform has a source of entropy.
-        seeding: Seeding::Continue { seed: Some(0) },
-        ..PoolConfig::new(&trace.env, 1)
-    };
+        .seeding(Seeding::Continue { seed: Some(0) });
     let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
     let mut blocks = zeroed(pool.layout().blocks());
     let mut replay = Replay::default();

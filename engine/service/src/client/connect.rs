@@ -18,6 +18,7 @@ const TRANSITION_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The engine to which a trainer or an observer connects.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct ConnectConfig {
     /// The engine's name.
     pub service: String,
@@ -32,6 +33,8 @@ impl ConnectConfig {
     pub fn new(service: &str) -> Self {
         ConnectConfig { service: service.to_owned(), namespace: Namespace::default(), timeout: Duration::ZERO }
     }
+
+    endless_gym_core::setters!(service: String, namespace: Namespace, timeout: Duration);
 }
 
 /// Converts a timeout in seconds. Timeouts beyond [`Duration::MAX`] become [`Duration::MAX`].

@@ -154,8 +154,7 @@ mod tests {
         let namespace = Namespace::at(format!("/tmp/endless-rest-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
         let config = EngineConfig::new("gym", pool, 1);
-        let engine =
-            Engine::new(memory_gym(), &EngineConfig { namespace: namespace.clone(), observers: 0, ..config }).unwrap();
+        let engine = Engine::new(memory_gym(), &config.namespace(namespace.clone()).observers(0)).unwrap();
         let (to_main, ready) = channel();
         let (to_rest, end) = channel::<()>();
         let (root, specification) = (&namespace, &engine.specification().clone());
@@ -176,7 +175,7 @@ mod tests {
             });
             ready.recv().unwrap();
             to_rest.send(()).unwrap();
-            let config = ConnectConfig { namespace: namespace.clone(), ..ConnectConfig::new("gym") };
+            let config = ConnectConfig::new("gym").namespace(namespace.clone());
             EngineConnection::open(&config).map(drop).unwrap();
         });
         drop(engine);

@@ -31,7 +31,7 @@ use crate::protocol::specification::ServiceSpecification;
 /// use endless_gym_service::{ConnectConfig, Trainer};
 ///
 /// let timeout = Duration::from_secs(10);
-/// let mut trainer = Trainer::connect(&ConnectConfig { timeout, ..ConnectConfig::new("endless") })?;
+/// let mut trainer = Trainer::connect(&ConnectConfig::new("endless").timeout(timeout))?;
 /// trainer.reset(0, ResetRequest::All)?;
 /// for _ in 0..1000 {
 ///     let lease = trainer.receive(0, timeout)?;
@@ -118,7 +118,7 @@ impl Trainer {
         let restarted = !lost.connection.is_engine_alive();
         let mut last: Vec<_> = self.groups.iter().map(|group| (None, group.pending.last())).collect();
         if restarted {
-            let config = ConnectConfig { timeout, ..lost.config.clone() };
+            let config = lost.config.clone().timeout(timeout);
             let (connection, specification) = EngineConnection::open(&config)?;
             if let Some(what) = lost.specification.difference(&specification) {
                 return Err(ServiceError::SpecificationChanged { service: config.service, what });

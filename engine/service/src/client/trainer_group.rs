@@ -63,7 +63,7 @@ impl Shared {
 /// use endless_gym_service::{ConnectConfig, ServiceError, Trainer};
 ///
 /// let timeout = Duration::from_secs(10);
-/// let mut trainer = Trainer::connect(&ConnectConfig { timeout, ..ConnectConfig::new("endless") })?;
+/// let mut trainer = Trainer::connect(&ConnectConfig::new("endless").timeout(timeout))?;
 /// std::thread::scope(|scope| {
 ///     for group in trainer.groups() {
 ///         scope.spawn(move || {

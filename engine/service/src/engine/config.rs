@@ -10,7 +10,8 @@ use crate::error::ServiceError;
 use crate::namespace::directory::{Namespace, check_name};
 use crate::protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
 
-/// Configuration of an engine: what it serves, and under which name.
+/// Configuration of an engine: what it serves, and under which name. [`new`](Self::new) has the defaults, and a method for each
+/// field changes one.
 ///
 /// Its JSON form uses the field names. Only `pool` is required; the other fields default to those of [`new`](Self::new)
 /// with the name `endless`. An unknown field is an error.
@@ -31,6 +32,7 @@ use crate::protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[non_exhaustive]
 pub struct EngineConfig {
     /// The engine's name: 1 to 64 letters, digits, `.`, `_` or `-`.
     #[serde(default = "default_service")]
@@ -93,6 +95,17 @@ impl EngineConfig {
         }
     }
 
+    endless_gym_core::setters! {
+        service: String,
+        namespace: Namespace,
+        pool: PoolConfig,
+        groups: usize,
+        threads: usize,
+        batches_held: usize,
+        observers: usize,
+        checkpoint: Option<CheckpointConfig>,
+    }
+
     pub(crate) fn check(&self) -> Result<(), ServiceError> {
         check_name(&self.service)?;
         let ranges = [
@@ -131,7 +144,7 @@ impl EngineConfig {
                     }
                 };
                 let first_env = first.saturating_add(first_here);
-                Ok(PoolConfig { options, first_env, total_envs, ..self.pool.clone() })
+                Ok(self.pool.clone().options(options).first_env(first_env).total_envs(total_envs))
             })
             .collect()
     }
@@ -140,6 +153,7 @@ impl EngineConfig {
 /// Where an engine saves its environments, and whether it resumes from there.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[non_exhaustive]
 pub struct CheckpointConfig {
     /// The file. A new checkpoint is written to `FILE.new` and replaces it when it is complete and on disk. The engine
     /// holds a lock on `FILE.lock` for its lifetime, so that no other engine saves to the same file.
@@ -169,6 +183,8 @@ impl CheckpointConfig {
     pub fn new(path: impl Into<PathBuf>) -> Self {
         CheckpointConfig { path: path.into(), every: None, resume: false }
     }
+
+    endless_gym_core::setters!(every: Option<Duration>, resume: bool);
 }
 
 #[cfg(test)]
@@ -181,15 +197,14 @@ mod tests {
 
     #[test]
     fn too_many_observers_are_an_error() {
-        let error = EngineConfig { observers: 17, ..config() }.check().unwrap_err();
+        let error = config().observers(17).check().unwrap_err();
         assert_eq!(error.to_string(), "observers must be 0 to 16, got 17");
     }
 
     #[test]
     fn json_has_the_fields_defaults_and_errors_of_the_type() {
-        let checkpoint =
-            CheckpointConfig { every: Some(Duration::from_millis(1500)), ..CheckpointConfig::new("/tmp/c") };
-        let full = EngineConfig { namespace: Namespace::at("/tmp/a"), checkpoint: Some(checkpoint), ..config() };
+        let checkpoint = CheckpointConfig::new("/tmp/c").every(Some(Duration::from_millis(1500)));
+        let full = config().namespace(Namespace::at("/tmp/a")).checkpoint(Some(checkpoint));
         let text = serde_json::to_string(&full).unwrap();
         assert_eq!(serde_json::from_str::<EngineConfig>(&text).unwrap(), full, "{text}");
         let short = r#"{"service": "gym", "pool": {"id": "MortarMayhem-Grid-v0", "num_envs": 2}, "threads": 1}"#;
@@ -201,13 +216,13 @@ mod tests {
     #[test]
     fn too_many_environments_are_an_error() {
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", usize::MAX);
-        let pools = EngineConfig { pool, groups: 2, ..config() }.pools();
+        let pools = config().pool(pool).groups(2).pools();
         assert!(matches!(pools, Err(PoolError::NumEnvs { given: usize::MAX })));
     }
 
     #[test]
     fn environments_are_numbered_across_groups() {
-        let pools = EngineConfig { groups: 3, ..config() }.pools().unwrap();
+        let pools = config().groups(3).pools().unwrap();
         let numbers: Vec<_> = pools.iter().map(|pool| (pool.first_env, pool.num_envs, pool.total_envs)).collect();
         assert_eq!(numbers, [(0, 2, 6), (2, 2, 6), (4, 2, 6)]);
     }
@@ -215,8 +230,8 @@ mod tests {
     #[test]
     fn environments_are_numbered_across_engines() {
         let numbered = |first_env, total_envs| {
-            let pool = PoolConfig { first_env, total_envs, ..config().pool };
-            let pools = EngineConfig { pool, groups: 2, ..config() }.pools().unwrap();
+            let pool = config().pool.first_env(first_env).total_envs(total_envs);
+            let pools = config().pool(pool).groups(2).pools().unwrap();
             pools.iter().map(|pool| (pool.first_env, pool.total_envs)).collect::<Vec<_>>()
         };
         assert_eq!(numbered(4, 12), [(4, 12), (6, 12)]);

@@ -63,7 +63,7 @@ const START_ATTEMPTS: usize = 3;
 /// let namespace = Namespace::default();
 /// # */
 /// let pool = PoolConfig::new("MortarMayhem-Grid-v0", 4);
-/// let config = EngineConfig { namespace: namespace.clone(), ..EngineConfig::new("example", pool, 1) };
+/// let config = EngineConfig::new("example", pool, 1).namespace(namespace.clone());
 /// let mut engine = Engine::new(memory_gym(), &config)?;
 /// let stop = AtomicBool::new(false);
 ///
@@ -71,7 +71,7 @@ const START_ATTEMPTS: usize = 3;
 ///     let running = scope.spawn(|| engine.run(&stop));
 ///     // Usually in another process:
 ///     let timeout = Duration::from_secs(10);
-///     let mut trainer = Trainer::connect(&ConnectConfig { namespace, timeout, ..ConnectConfig::new("example") })?;
+///     let mut trainer = Trainer::connect(&ConnectConfig::new("example").namespace(namespace).timeout(timeout))?;
 ///     trainer.reset(0, ResetRequest::Seed(1))?;
 ///     let first = trainer.receive(0, timeout)?;
 ///     assert_eq!(first.batch().observation().len(), 4 * 84 * 84 * 3);
@@ -537,7 +537,7 @@ mod tests {
         let namespace = Namespace::at(format!("/tmp/endless-found-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
         let config = EngineConfig::new("gym", pool, 1);
-        let engine = Engine::new(memory_gym(), &EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
+        let engine = Engine::new(memory_gym(), &config.namespace(namespace.clone())).unwrap();
         let check = || Engine::check_published(&engine.node, engine.specification());
         check().unwrap();
         let services = namespace.root().join("services");

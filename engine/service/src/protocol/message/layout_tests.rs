@@ -42,7 +42,7 @@ fn the_documentation_shows_the_layout() {
     let kinds: Vec<_> = RequestKind::ALL.iter().map(|kind| format!("{kind:?} = {}", kind.code())).collect();
     writeln!(text, "enum kind {{ {} }};\n", kinds.join(", ")).unwrap();
     header!(text, ResponseHeader: layout_version group incarnation step trainer request bytes status padding);
-    let config = PoolConfig { features: true, ..PoolConfig::new("MortarMayhem-Grid-v0", 4) };
+    let config = PoolConfig::new("MortarMayhem-Grid-v0", 4).features(true);
     let pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
     sections(&mut text, "Batch", pool.layout());
     sections(&mut text, "Request", &action_layout(&pool.spec().action_space, 4).unwrap());

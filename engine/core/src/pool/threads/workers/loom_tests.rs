@@ -150,8 +150,7 @@ fn loom_workers_end_without_a_call() {
 #[test]
 fn loom_a_pool_steps_every_environment_once() {
     fn play(threads: &Threads) -> Vec<u8> {
-        let config =
-            PoolConfig { frames: None, seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(ID, 64) };
+        let config = PoolConfig::new(ID, 64).frames(None).seeding(Seeding::Continue { seed: Some(1) });
         let mut pool = Pool::new(toys(), &config, threads).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
