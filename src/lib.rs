@@ -88,9 +88,9 @@ pub mod envs {
 /// Many environments in this process, stepped in lockstep.
 pub mod pool {
     pub use endless_gym_core::pool::{
-        Autoreset, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig, PoolError,
-        Registry, RegistryError, ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION, SavedEnv,
-        Seeding, SnapshotError, StepTimes, Threads, UnknownAutoreset, WrongFrame,
+        Autoreset, EnvReset, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig,
+        PoolError, Registry, RegistryError, ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION,
+        SavedEnv, Seeding, SnapshotError, StepTimes, Threads, UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
 }

@@ -9,7 +9,7 @@ use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
 use endless_gym::envs::EnvSpec;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
-    Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads, WrongFrame,
+    Autoreset, EnvReset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads, WrongFrame,
 };
 use endless_gym_memory_gym::{FRAME, SCREEN};
 use proptest::prelude::*;
@@ -51,9 +51,12 @@ fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mu
                 pool.restore(random.random_range(0..NUM_ENVS), &snapshot).unwrap();
             }
             5 => {
-                let reset = [0; NUM_ENVS].map(|_| random.random_range(0..3));
-                let seed = [0; NUM_ENVS].map(|_| random.random_range(0..1000));
-                pool.reset(ResetRequest::Each { reset: &reset, seed: &seed }, &mut buffers[used])?;
+                let each = [0; NUM_ENVS].map(|_| match random.random_range(0..3) {
+                    0 => EnvReset::Keep,
+                    1 => EnvReset::Next,
+                    _ => EnvReset::Seed(random.random_range(0..1000)),
+                });
+                pool.reset(ResetRequest::Each(&each), &mut buffers[used])?;
             }
             6 => pool.reset(ResetRequest::Seed(random.random()), &mut buffers[used])?,
             7 => drop(pool.ground_truth_view(0)?),

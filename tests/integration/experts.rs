@@ -89,7 +89,9 @@ fn endless_searing_spotlights_lasts() {
 mod pools {
     use endless_gym::batch::{Batch, zeroed};
     use endless_gym::memory_gym;
-    use endless_gym::pool::{Autoreset, Experts, ExpertsError, Pool, PoolConfig, ResetRequest, Seeding, Threads};
+    use endless_gym::pool::{
+        Autoreset, EnvReset, Experts, ExpertsError, Pool, PoolConfig, ResetRequest, Seeding, Threads,
+    };
 
     const NUM_ENVS: usize = 3;
     const EPISODES: usize = 3;
@@ -119,7 +121,9 @@ mod pools {
                 episodes[env].push((batch.episode_return()[env], batch.episode_length()[env]));
             }
             if autoreset == Autoreset::Disabled && ended.contains(&1) {
-                pool.reset(ResetRequest::Each { reset: &ended, seed: &[0; NUM_ENVS] }, &mut blocks).unwrap();
+                let each: Vec<_> =
+                    ended.iter().map(|ended| if *ended == 1 { EnvReset::Next } else { EnvReset::Keep }).collect();
+                pool.reset(ResetRequest::Each(&each), &mut blocks).unwrap();
             }
             if episodes.iter().all(|episodes| episodes.len() >= EPISODES) {
                 break;

@@ -1,7 +1,7 @@
 //! Reset parameters of next episodes, and seed and options of running episodes, in a pool.
 
 use crate::support::player::Player;
-use endless_gym::pool::{Autoreset, NextOptions, PoolConfig, PoolError, ResetRequest, Seeding};
+use endless_gym::pool::{Autoreset, EnvReset, NextOptions, PoolConfig, PoolError, ResetRequest, Seeding};
 use serde_json::{Map, Value as Json, json};
 
 /// With an agent that does nothing, an episode ends within a few dozen steps.
@@ -65,7 +65,7 @@ fn next_options_apply_from_the_next_episode_on_in_every_autoreset_mode() {
             }
         }
         assert_eq!(ended, [true; 3]);
-        player.reset(ResetRequest::Each { reset: &[0, 0, 1], seed: &[0; 3] });
+        player.reset(ResetRequest::Each(&[EnvReset::Keep, EnvReset::Keep, EnvReset::Next]));
         assert_eq!(running(&player, 2), one);
         // A reset with options replaces them.
         player.pool.set_options(&[next(&three, &[2])]).unwrap();

@@ -7,7 +7,7 @@ use crate::support::recorded::{options as any_options, property_cases};
 use endless_gym::envs::ActionError;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
-    Autoreset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
+    Autoreset, EnvReset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
 use endless_gym_memory_gym::FRAME;
 use proptest::prelude::*;
@@ -139,7 +139,7 @@ fn disabled_autoreset_leaves_resets_to_the_trainer() {
     }
     assert_eq!(player.batch().episode_length(), [30; 3], "no environment resets");
     let before = frame(&player, 0);
-    player.reset(ResetRequest::Each { reset: &[0, 1, 2], seed: &[0, 0, 77] });
+    player.reset(ResetRequest::Each(&[EnvReset::Keep, EnvReset::Next, EnvReset::Seed(77)]));
     assert_eq!(player.batch().episode_length(), [30, 0, 0]);
     assert_eq!(frame(&player, 0), before);
     assert_eq!(frame(&player, 2), first_frame(77));
@@ -185,7 +185,7 @@ fn all_episodes_after_a_seeded_reset_depend_only_on_its_seed() {
     for pair in pairs {
         // One pool resets with a common seed, the other with a seed for each environment, after a different number of
         // episodes.
-        let each = [ResetRequest::Seed(50), ResetRequest::Each { reset: &[2, 2], seed: &[50, 51] }];
+        let each = [ResetRequest::Seed(50), ResetRequest::Each(&[50, 51].map(EnvReset::Seed))];
         let shown = pair.clone().into_iter().zip(each).enumerate().map(|(before, (seeding, request))| {
             let mut player = Player::started(&config(2).seeding(seeding));
             for _ in 0..before {
@@ -236,7 +236,7 @@ fn a_reset_may_change_the_options() {
     let mut fresh = Player::started(&config(2).options(ResetOptions::Shared(other.clone())));
     let mut player = Player::started(&config(2));
     let before = frame(&player, 1);
-    let request = ResetRequest::Each { reset: &[2, 0], seed: &[3, 0] };
+    let request = ResetRequest::Each(&[EnvReset::Seed(3), EnvReset::Keep]);
     player.pool.reset_with(request, Some(&other), &mut player.blocks).unwrap();
     assert_eq!(frame(&player, 1), before, "an environment that is not reset keeps its options");
     for _ in 0..200 {
@@ -311,7 +311,7 @@ fn wrong_calls_are_refused_and_change_nothing() {
         Err(PoolError::Action(ActionError::Range { env: 0, .. }))
     ));
     assert!(matches!(pool.step(&[0; 4], &mut blocks[1..]), Err(PoolError::BatchTooShort { .. })));
-    let request = ResetRequest::Each { reset: &[1], seed: &[1] };
+    let request = ResetRequest::Each(&[EnvReset::Next]);
     assert!(matches!(pool.reset(request, &mut blocks), Err(PoolError::ResetCount { .. })));
     assert!(bytemuck::cast_slice::<_, u8>(&before) == bytemuck::cast_slice::<_, u8>(&blocks));
 }

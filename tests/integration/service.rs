@@ -12,7 +12,7 @@ use crate::support::service::{ID, assert_error, assert_rejected, play, send, set
 use endless_gym::batch::Block;
 use endless_gym::envs::{ActionError, ActionSpace};
 use endless_gym::memory_gym;
-use endless_gym::pool::{PoolConfig, ResetRequest};
+use endless_gym::pool::{EnvReset, PoolConfig, ResetRequest};
 use endless_gym::service::{
     ConnectConfig, Engine, EngineStatus, Namespace, Observer, ROOT_VARIABLE, Rejection, ServiceError,
     ServiceSpecification, Trainer, running_engines,
@@ -51,7 +51,7 @@ fn groups_are_reset_and_stepped_independently() {
     assert_eq!(stepped.batch().episode_length(), [1; 4]);
     assert_eq!(first.batch().episode_length(), [0; 4], "a held batch does not change");
 
-    trainer.reset(0, ResetRequest::Each { reset: &[0, 2, 0, 1], seed: &[0, 7, 0, 0] }).unwrap();
+    trainer.reset(0, ResetRequest::Each(&[EnvReset::Keep, EnvReset::Seed(7), EnvReset::Keep, EnvReset::Next])).unwrap();
     let again = trainer.receive(0, TIMEOUT).unwrap();
     assert_eq!(again.batch().episode_length(), [1, 0, 1, 0]);
     drop((first, stepped));
@@ -81,7 +81,7 @@ fn mistakes_of_a_trainer_are_typed_errors() {
         assert_error!(trainer.reset(1, ResetRequest::All), ServiceError::NoSuchGroup { given: 1, .. });
         assert_error!(trainer.receive(0, TIMEOUT), ServiceError::NothingSent { group: 0 });
         assert_error!(trainer.receive_any(TIMEOUT), ServiceError::NothingPending);
-        let reset = ResetRequest::Each { reset: &[1, 1], seed: &[1] };
+        let reset = ResetRequest::Each(&[EnvReset::Next]);
         assert_error!(trainer.reset(0, reset), ServiceError::ResetCount { given: 1, num_envs: 2 });
         let wrong = trainer.send(0, &[0]);
         assert_error!(wrong, ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }));

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use endless_gym::memory_gym;
 use endless_gym::pool::PoolConfig;
-use endless_gym::service::{Engine, EngineStatus, Observer, Observers, Trainer};
+use endless_gym::service::{Engine, EngineConfig, EngineStatus, Observer, Observers, Trainer};
 
 use crate::support::place::Place;
 use crate::support::process::{TIMEOUT, wait_until};

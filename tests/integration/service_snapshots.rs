@@ -9,7 +9,7 @@ use crate::support::player::Player;
 use crate::support::process::TIMEOUT;
 use crate::support::service::{ID, assert_error, assert_rejected, reset};
 use endless_gym::memory_gym;
-use endless_gym::pool::{PoolConfig, ResetOptions, ResetRequest};
+use endless_gym::pool::{EnvReset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
 use endless_gym_core::batch::SNAPSHOT_BYTES;
 
@@ -54,7 +54,7 @@ fn restored_environments_continue_identically_in_both_directions() {
         trainer.restore(0, env, snapshot, TIMEOUT).unwrap();
         player.pool.restore(env, snapshot).unwrap();
     }
-    trainer.reset(0, ResetRequest::Each { reset: &[0; NUM_ENVS], seed: &[0; NUM_ENVS] }).unwrap();
+    trainer.reset(0, ResetRequest::Each(&[EnvReset::Keep; NUM_ENVS])).unwrap();
     let shown = trainer.receive(0, TIMEOUT).unwrap();
     player.observe();
     assert!(shown.batch().bytes() == player.bytes());

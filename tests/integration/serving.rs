@@ -9,7 +9,7 @@ use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::{Process, TIMEOUT, text, wait_until};
 use crate::support::service::{assert_rejected, reset, send, step, try_step};
-use endless_gym::pool::{PoolConfig, ResetRequest, Seeding};
+use endless_gym::pool::{EnvReset, PoolConfig, ResetRequest, Seeding};
 use endless_gym::service::{Observer, Rejection, Trainer};
 use endless_gym_core::conformance::seal;
 use rustix::process::Signal;
@@ -71,7 +71,7 @@ impl Twin {
     /// Adopts the engine's episodes.
     fn adopt(&mut self, trainer: &mut Trainer) {
         for (group, twin) in self.groups.iter_mut().enumerate() {
-            trainer.reset(group, ResetRequest::Each { reset: &[0; NUM_ENVS], seed: &[0; NUM_ENVS] }).unwrap();
+            trainer.reset(group, ResetRequest::Each(&[EnvReset::Keep; NUM_ENVS])).unwrap();
             twin.observe();
             let received = trainer.receive(group, TIMEOUT).unwrap();
             assert!(received.batch().bytes() == twin.bytes());
@@ -212,7 +212,7 @@ fn a_forged_state_in_a_checkpoint_is_refused() {
         if is_valid {
             let engine = serve();
             let mut trainer = place.trainer("gym").unwrap();
-            trainer.reset(0, ResetRequest::Each { reset: &[0], seed: &[0] }).unwrap();
+            trainer.reset(0, ResetRequest::Each(&[EnvReset::Keep])).unwrap();
             trainer.receive(0, TIMEOUT).unwrap();
             assert!(step(&mut trainer, 0).batch().reward()[0].is_finite());
             drop(trainer);

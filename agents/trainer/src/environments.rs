@@ -6,7 +6,7 @@ use std::time::Duration;
 use endless_gym_core::batch::{Batch, BatchBuffer, BatchSection, Section};
 use endless_gym_core::envs::{EnvSpec, ObservationSpace};
 use endless_gym_core::pool::{
-    Autoreset, Pool, PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, Seeding, Threads,
+    Autoreset, EnvReset, Pool, PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, Seeding, Threads,
 };
 use endless_gym_service::{BatchLease, Trainer};
 
@@ -196,7 +196,7 @@ impl Environments {
     ///
     /// Those of pools and trainers.
     pub fn restore(&mut self, snapshots: &[Vec<u8>]) -> Result<(), Error> {
-        let none = vec![0; self.per_group];
+        let none = vec![EnvReset::Keep; self.per_group];
         for (group, snapshots) in snapshots.chunks(self.per_group).enumerate() {
             match &mut self.place {
                 Stepping::InProcess(pools) => {
@@ -211,8 +211,7 @@ impl Environments {
                     for (env, snapshot) in snapshots.iter().enumerate() {
                         trainer.restore(group, env, snapshot, TIMEOUT)?;
                     }
-                    let seeds = vec![0; none.len()];
-                    trainer.reset(group, ResetRequest::Each { reset: &none, seed: &seeds })?;
+                    trainer.reset(group, ResetRequest::Each(&none))?;
                 }
             }
         }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use endless_gym::batch::Frames;
 use endless_gym::envs::ActionSpace;
-use endless_gym::pool::{ResetRequest, RunningEpisode};
+use endless_gym::pool::{EnvReset, ResetRequest, RunningEpisode};
 use endless_gym::raster::FrameShape;
 use endless_gym::service::timeout_from_seconds;
 use numpy::{
@@ -200,8 +200,19 @@ pub fn episode(RunningEpisode { env, seed, options, ended }: RunningEpisode) -> 
 pub enum Reset {
     /// All environments of the group; environment `i` of group `g` is seeded with this seed plus `g * num_envs + i`.
     Seed(u64),
-    /// A reset mask and seeds, one of each per environment: 0 does not reset, 1 starts the next episode, 2 starts one with the seed.
-    Each(Vec<u8>, Vec<u64>),
+    /// One item for each environment, from a reset mask and seeds: 0 does not reset, 1 starts the next episode, 2 starts one with the
+    /// seed.
+    Each(#[pyo3(from_py_with = each)] Vec<EnvReset>),
+}
+
+fn each(given: &Bound<'_, PyAny>) -> PyResult<Vec<EnvReset>> {
+    let (reset, seed): (Vec<u8>, Vec<u64>) = given.extract()?;
+    let item = |(reset, seed)| match reset {
+        0 => EnvReset::Keep,
+        1 => EnvReset::Next,
+        _ => EnvReset::Seed(seed),
+    };
+    Ok(reset.into_iter().zip(seed).map(item).collect())
 }
 
 impl Reset {
@@ -210,7 +221,7 @@ impl Reset {
         match request {
             None => ResetRequest::All,
             Some(Reset::Seed(seed)) => ResetRequest::Seed(*seed),
-            Some(Reset::Each(reset, seed)) => ResetRequest::Each { reset, seed },
+            Some(Reset::Each(each)) => ResetRequest::Each(each),
         }
     }
 }

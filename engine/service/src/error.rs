@@ -219,10 +219,10 @@ pub enum ServiceError {
     /// The number of actions is wrong, or an action is out of range. No environment has been stepped.
     #[error(transparent)]
     Action(#[from] ActionError),
-    /// A reset has too few or too many flags or seeds.
-    #[error("reset must have {num_envs} flags and {num_envs} seeds, one for each environment, got {given}")]
+    /// A reset request has the wrong length.
+    #[error("a reset of single environments must have {num_envs} items, one for each environment, got {given}")]
     ResetCount {
-        /// Number of flags or seeds that were given.
+        /// Number of items that were given.
         given: usize,
         /// Environments in the group.
         num_envs: usize,

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use endless_gym::environments;
 use endless_gym_core::batch::{BatchSection, Block, Layout, Section, zeroed};
 use endless_gym_core::envs::ActionSpace;
-use endless_gym_core::pool::{OptionMap, Pool, PoolError, ResetRequest, SnapshotError, Threads};
+use endless_gym_core::pool::{EnvReset, OptionMap, Pool, PoolError, ResetRequest, SnapshotError, Threads};
 use endless_gym_core::random::Generator;
 use endless_gym_service::{BatchLease, ServiceError, ServiceSpecification, Trainer};
 
@@ -16,7 +16,7 @@ use crate::shape::Shape;
 #[derive(Clone, Debug)]
 pub enum Request {
     Seed { seed: u64, options: Option<OptionMap> },
-    Each { reset: Vec<u8>, seed: Vec<u64>, options: Option<OptionMap> },
+    Each { each: Vec<EnvReset>, options: Option<OptionMap> },
     Step(Vec<i32>),
 }
 
@@ -26,10 +26,13 @@ impl Request {
         let num_envs = shape.num_envs;
         if draws.integers(0, 40) == 0 {
             // An unseeded episode depends on earlier ones, so each environment is reset with a seed or not at all.
-            let reset = (0..num_envs).map(|_| 2 * draws.integers(0, 2) as u8).collect();
-            let seed = (0..num_envs).map(|_| draws.integers(0, 1 << 32) as u64).collect();
+            let mut item = || match draws.integers(0, 2) {
+                0 => EnvReset::Keep,
+                _ => EnvReset::Seed(draws.integers(0, 1 << 32) as u64),
+            };
+            let each = (0..num_envs).map(|_| item()).collect();
             let options = (with_options && draws.integers(0, 2) == 0).then(|| options::random(draws, &shape.id));
-            return Request::Each { reset, seed, options };
+            return Request::Each { each, options };
         }
         Request::Step((0..num_envs).flat_map(|_| action(draws, space)).collect())
     }
@@ -38,9 +41,7 @@ impl Request {
     pub fn send(&self, trainer: &mut Trainer, group: usize) -> Result<(), ServiceError> {
         match self {
             Request::Seed { seed, options } => trainer.reset_with(group, ResetRequest::Seed(*seed), options.as_ref()),
-            Request::Each { reset, seed, options } => {
-                trainer.reset_with(group, ResetRequest::Each { reset, seed }, options.as_ref())
-            }
+            Request::Each { each, options } => trainer.reset_with(group, ResetRequest::Each(each), options.as_ref()),
             Request::Step(actions) => trainer.send(group, actions),
         }
     }
@@ -131,8 +132,8 @@ impl Twin {
             Request::Seed { seed, options } => {
                 self.pool.reset_with(ResetRequest::Seed(*seed), options.as_ref(), &mut buffer)
             }
-            Request::Each { reset, seed, options } => {
-                self.pool.reset_with(ResetRequest::Each { reset, seed }, options.as_ref(), &mut buffer)
+            Request::Each { each, options } => {
+                self.pool.reset_with(ResetRequest::Each(each), options.as_ref(), &mut buffer)
             }
             Request::Step(actions) => self.pool.step(actions, &mut buffer),
         }?;

@@ -2,7 +2,7 @@
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::zeroed;
-use endless_gym_core::pool::{Autoreset, OptionMap, ResetRequest};
+use endless_gym_core::pool::{Autoreset, EnvReset, OptionMap, ResetRequest};
 
 use crate::playing;
 
@@ -27,8 +27,12 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
                 assert!(played || pool.snapshot(0).expect("it exists") == before, "a refused action changes nothing");
             }
             1 => {
-                let (reset, seed): (Vec<u8>, Vec<u64>) = input.arbitrary()?;
-                let reset = pool.reset(ResetRequest::Each { reset: &reset, seed: &seed }, &mut blocks).is_ok();
+                let each: Vec<Option<Option<u64>>> = input.arbitrary()?;
+                let item = |reset: &Option<_>| {
+                    reset.map_or(EnvReset::Keep, |seed: Option<_>| seed.map_or(EnvReset::Next, EnvReset::Seed))
+                };
+                let each: Vec<_> = each.iter().map(item).collect();
+                let reset = pool.reset(ResetRequest::Each(&each), &mut blocks).is_ok();
                 assert!(reset || pool.snapshot(0).expect("it exists") == before, "a refused reset changes nothing");
             }
             2 => {

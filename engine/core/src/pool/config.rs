@@ -262,14 +262,20 @@ pub enum ResetRequest<'a> {
     /// All; environment `i` of the pool is seeded with `seed + first_env + i` (wrapping), where `first_env` is
     /// [`PoolConfig::first_env`].
     Seed(u64),
-    /// Individually, as `reset` says for each environment.
-    Each {
-        /// For each environment: 0 does not reset it, 1 starts an episode with the next seed of [`Seeding`], and 2 starts one
-        /// with its item of `seed`. Other values count as 2.
-        reset: &'a [u8],
-        /// A seed for each environment, used where `reset` is 2.
-        seed: &'a [u64],
-    },
+    /// Individually, one item for each environment.
+    Each(&'a [EnvReset]),
+}
+
+/// Whether one environment starts an episode.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum EnvReset {
+    /// No: its episode continues.
+    #[default]
+    Keep,
+    /// With the next seed of [`Seeding`].
+    Next,
+    /// With this seed.
+    Seed(u64),
 }
 
 impl ResetRequest<'_> {
@@ -277,7 +283,7 @@ impl ResetRequest<'_> {
     pub(super) fn resets(&self, env: usize) -> bool {
         match self {
             ResetRequest::All | ResetRequest::Seed(_) => true,
-            ResetRequest::Each { reset, .. } => reset[env] != 0,
+            ResetRequest::Each(each) => each[env] != EnvReset::Keep,
         }
     }
 }

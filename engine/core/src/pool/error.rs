@@ -101,13 +101,11 @@ pub enum PoolError {
     /// There are too few or too many actions, or one is out of range.
     #[error(transparent)]
     Action(#[from] ActionError),
-    /// A reset request has the wrong number of flags or seeds.
-    #[error("a reset request must have {num_envs} flags and {num_envs} seeds, got {flags} and {seeds}")]
+    /// A reset request has the wrong length.
+    #[error("a reset of single environments must have {num_envs} items, one for each environment, got {given}")]
     ResetCount {
-        /// Number of flags that were given.
-        flags: usize,
-        /// Number of seeds that were given.
-        seeds: usize,
+        /// Number of items that were given.
+        given: usize,
         /// Number of environments in the pool.
         num_envs: usize,
     },

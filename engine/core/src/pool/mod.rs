@@ -25,7 +25,7 @@ mod typed_envs;
 
 pub use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 pub use autoreset::{Autoreset, UnknownAutoreset};
-pub use config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
+pub use config::{EnvReset, OptionMap, PoolConfig, ResetOptions, ResetRequest};
 pub use drawn_scene::WrongFrame;
 pub use env_panic::EnvPanic;
 pub use episodes::{NextOptions, RunningEpisode};

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::autoreset::Autoreset;
 use super::buffers::Buffers;
-use super::config::{OptionMap, PoolConfig, ResetRequest};
+use super::config::{EnvReset, OptionMap, PoolConfig, ResetRequest};
 use super::drawn_scene::{DrawSettings, FrameFormat};
 use super::env_panic::{EnvPanic, catch};
 use super::episodes::{NextOptions, RunningEpisode};
@@ -116,7 +116,7 @@ impl Pool {
     ///
     /// # Errors
     ///
-    /// [`PoolError`] if `request` has the wrong number of flags or seeds, if the first reset omits an environment, if an option
+    /// [`PoolError`] if `request` has the wrong length, if the first reset omits an environment, if an option
     /// is invalid, or if `batch` is too short. Except for [`PoolError::WrongFrame`] and [`PoolError::Panic`], an error changes no
     /// environment.
     pub fn reset_with(
@@ -131,10 +131,10 @@ impl Pool {
             other => other,
         };
         match request {
-            ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
-                return Err(PoolError::ResetCount { flags: reset.len(), seeds: seed.len(), num_envs });
+            ResetRequest::Each(each) if each.len() != num_envs => {
+                return Err(PoolError::ResetCount { given: each.len(), num_envs });
             }
-            ResetRequest::Each { reset, .. } if !self.was_reset && reset.contains(&0) => {
+            ResetRequest::Each(each) if !self.was_reset && each.contains(&EnvReset::Keep) => {
                 return Err(PoolError::NotReset);
             }
             _ => {}
@@ -237,7 +237,7 @@ impl Pool {
     /// See [`reset`](Pool::reset).
     pub fn observe(&mut self, batch: &mut [Block]) -> Result<(), PoolError> {
         let num_envs = self.layout.num_envs();
-        self.reset(ResetRequest::Each { reset: &vec![0; num_envs], seed: &vec![0; num_envs] }, batch)
+        self.reset(ResetRequest::Each(&vec![EnvReset::Keep; num_envs]), batch)
     }
 
     /// The complete state of one environment, including its generator, for [`restore`](Pool::restore).

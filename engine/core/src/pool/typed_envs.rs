@@ -8,7 +8,7 @@ use std::sync::Arc;
 use serde_json::Value as Json;
 
 use super::autoreset::Autoreset;
-use super::config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
+use super::config::{EnvReset, OptionMap, PoolConfig, ResetOptions, ResetRequest};
 use super::division::EnvRange;
 use super::drawn_scene::{DrawSettings, DrawnScene, FrameFormat, WrongFrame, draw_in_full};
 use super::env_panic::{EnvPanic, catch};
@@ -222,10 +222,10 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
             match request {
                 ResetRequest::All => slot.start_episode(None),
                 ResetRequest::Seed(seed) => slot.start_episode(Some(seed.wrapping_add(env as u64))),
-                ResetRequest::Each { reset, seed } => match reset[env] {
-                    0 => {}
-                    1 => slot.start_episode(None),
-                    _ => slot.start_episode(Some(seed[env])),
+                ResetRequest::Each(each) => match each[env] {
+                    EnvReset::Keep => {}
+                    EnvReset::Next => slot.start_episode(None),
+                    EnvReset::Seed(seed) => slot.start_episode(Some(seed)),
                 },
             }
             slot.write_start(out, row);

@@ -6,7 +6,7 @@ use serde_json::{Map, Value as Json};
 
 use super::format::{Trace, TraceError};
 use crate::batch::{Batch, Block, zeroed};
-use crate::pool::{Autoreset, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
+use crate::pool::{Autoreset, EnvReset, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
 
 /// The outcome of a replay.
 #[derive(Debug, Default)]
@@ -93,7 +93,7 @@ pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> 
     let mut replay = Replay::default();
     for episode in &trace.episodes {
         match episode.seed {
-            Some(seed) => pool.reset(ResetRequest::Each { reset: &[2], seed: &[seed] }, &mut blocks)?,
+            Some(seed) => pool.reset(ResetRequest::Each(&[EnvReset::Seed(seed)]), &mut blocks)?,
             None => pool.reset(ResetRequest::All, &mut blocks)?,
         }
         let batch = Batch::new(pool.layout(), &blocks);

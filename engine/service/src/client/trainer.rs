@@ -162,7 +162,7 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::ResetCount`] if the reset mask or the seeds have a wrong length, [`ServiceError::NoSuchGroup`],
+    /// [`ServiceError::ResetCount`] if the request has the wrong length, [`ServiceError::NoSuchGroup`],
     /// [`ServiceError::AnswerPending`], [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has ended,
     /// and [`ServiceError::Middleware`] if iceoryx2 cannot send the request.
     pub fn reset(&mut self, group: usize, request: ResetRequest<'_>) -> Result<(), ServiceError> {
@@ -285,7 +285,7 @@ impl Trainer {
     ///
     /// ```no_run
     /// # use std::time::Duration;
-    /// # use endless_gym_core::pool::ResetRequest;
+    /// # use endless_gym_core::pool::{EnvReset, ResetRequest};
     /// # use endless_gym_service::{ConnectConfig, Trainer};
     /// # let timeout = Duration::from_secs(10);
     /// # let mut trainer = Trainer::connect(&ConnectConfig::new("endless"))?;
@@ -296,7 +296,7 @@ impl Trainer {
     /// trainer.restore(0, 5, &snapshot, timeout)?;
     /// // A reset of no environment returns the current observations.
     /// let num_envs = trainer.specification().num_envs;
-    /// trainer.reset(0, ResetRequest::Each { reset: &vec![0; num_envs], seed: &vec![0; num_envs] })?;
+    /// trainer.reset(0, ResetRequest::Each(&vec![EnvReset::Keep; num_envs]))?;
     /// let lease = trainer.receive(0, timeout)?;
     /// # Ok::<(), endless_gym_service::ServiceError>(())
     /// ```

@@ -17,7 +17,7 @@ use crate::client::requests::{PendingRequest, Request};
 use crate::client::status;
 use crate::error::{EngineActivity, ServiceError};
 use crate::namespace::fork_guard::ForkGuard;
-use crate::protocol::message::{RequestHeader, RequestKind};
+use crate::protocol::message::{RequestHeader, RequestKind, encode_reset};
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::wait::LIVENESS_INTERVAL;
 use crate::protocol::{discovery, ports};
@@ -139,13 +139,15 @@ impl TrainerGroup {
             ResetRequest::Seed(seed) => {
                 self.post(Request { seed, ..Request::new(RequestKind::ResetSeed) }, write_options)
             }
-            ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
-                let given = if reset.len() == num_envs { seed.len() } else { reset.len() };
-                Err(ServiceError::ResetCount { given, num_envs })
+            ResetRequest::Each(each) if each.len() != num_envs => {
+                Err(ServiceError::ResetCount { given: each.len(), num_envs })
             }
-            ResetRequest::Each { reset, seed } => self.post(Request::new(RequestKind::ResetEach), |message| {
-                specification.action.write::<u8>(message, ActionSection::Reset).copy_from_slice(reset);
-                specification.action.write::<u64>(message, ActionSection::Seed).copy_from_slice(seed);
+            ResetRequest::Each(each) => self.post(Request::new(RequestKind::ResetEach), |message| {
+                for (env, reset) in each.iter().enumerate() {
+                    let (reset, seed) = encode_reset(*reset);
+                    specification.action.write::<u8>(message, ActionSection::Reset)[env] = reset;
+                    specification.action.write::<u64>(message, ActionSection::Seed)[env] = seed;
+                }
                 write_options(message)
             }),
         }

@@ -2,7 +2,7 @@
 
 use endless_gym_core::batch::{ActionLayout, ActionSection, Batch, Block, LAYOUT_VERSION, SNAPSHOT_BYTES};
 use endless_gym_core::pool::{
-    NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError, Threads,
+    EnvReset, NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError, Threads,
 };
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
@@ -16,7 +16,7 @@ use serde_json::{Map, Value as Json};
 use crate::error::{Rejection, ServiceError};
 use crate::namespace::directory::Ipc;
 use crate::namespace::memory::PrefaultedChunks;
-use crate::protocol::message::{PayloadBlock, RequestHeader, RequestKind, ResponseHeader, write_text};
+use crate::protocol::message::{PayloadBlock, RequestHeader, RequestKind, ResponseHeader, decode_reset, write_text};
 use crate::protocol::ports::{self, BlockService, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
 use crate::protocol::wait::lock;
 
@@ -192,8 +192,8 @@ impl Group {
         let is_allowed = match kind {
             RequestKind::Step | RequestKind::Snapshot | RequestKind::Restore | RequestKind::Episodes => false,
             RequestKind::ResetEach => {
-                let count = self.request.reset.iter().filter(|flag| **flag != 0).count();
-                count == 0 || count == self.request.reset.len()
+                let count = self.request.resets.iter().filter(|reset| **reset != EnvReset::Keep).count();
+                count == 0 || count == self.request.resets.len()
             }
             RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Checkpoint | RequestKind::SetOptions => true,
         };
@@ -211,7 +211,7 @@ impl Group {
         header: &RequestHeader,
         payload: &mut [Block],
     ) -> Result<Outcome, Rejected> {
-        let RequestData { action, reset, seed, snapshot, options, next_options, .. } = &self.request;
+        let RequestData { action, resets, snapshot, options, next_options, .. } = &self.request;
         let (options, env) = (options.as_ref(), usize::try_from(header.env).unwrap_or(usize::MAX));
         let batch_blocks = self.pool.layout().blocks();
         let batch = &mut payload[..batch_blocks];
@@ -224,7 +224,7 @@ impl Group {
             }
             RequestKind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
             RequestKind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
-            RequestKind::ResetEach => self.pool.reset_with(ResetRequest::Each { reset, seed }, options, batch),
+            RequestKind::ResetEach => self.pool.reset_with(ResetRequest::Each(resets), options, batch),
             RequestKind::SetOptions => self.pool.set_options(next_options),
             RequestKind::Episodes => return self.write_episodes(payload),
             // Executed by the engine.
@@ -276,7 +276,7 @@ impl Group {
         self.forget_frames(payload);
         let text: &mut [u8] = bytemuck::cast_slice_mut(payload);
         let mut end = 0;
-        for env in (0..self.request.reset.len()).filter(|env| self.request.reset[*env] != 0) {
+        for env in (0..self.request.envs.len()).filter(|env| self.request.envs[*env] != 0) {
             let episode = self.pool.running_episode(env).map_err(|e| (Rejection::NotReset, e.to_string()))?;
             let item = serde_json::to_vec(&episode).map_err(|e| (Rejection::Pool, e.to_string()))?;
             // A separator before it, and a bracket after the last.
@@ -392,8 +392,9 @@ impl Groups {
 #[derive(Debug, Default)]
 struct RequestData {
     action: Vec<i32>,
-    reset: Vec<u8>,
-    seed: Vec<u64>,
+    resets: Vec<EnvReset>,
+    /// For each environment, whether its running episode was asked for.
+    envs: Vec<u8>,
     snapshot: Vec<u8>,
     options_text: Vec<u8>,
     options: Option<Map<String, Json>>,
@@ -422,10 +423,12 @@ impl RequestData {
         match kind {
             RequestKind::Step => copy(&mut self.action, layout.read(payload, ActionSection::Action)),
             RequestKind::ResetEach => {
-                copy(&mut self.reset, layout.read(payload, ActionSection::Reset));
-                copy(&mut self.seed, layout.read(payload, ActionSection::Seed));
+                let seeds = layout.read::<u64>(payload, ActionSection::Seed);
+                self.resets.clear();
+                let items = layout.read::<u8>(payload, ActionSection::Reset).iter().zip(seeds);
+                self.resets.extend(items.map(|(reset, seed)| decode_reset(*reset, *seed)));
             }
-            RequestKind::Episodes => copy(&mut self.reset, layout.read(payload, ActionSection::Reset)),
+            RequestKind::Episodes => copy(&mut self.envs, layout.read(payload, ActionSection::Reset)),
             RequestKind::Restore | RequestKind::SetOptions => {
                 copy(&mut self.snapshot, prefix(layout.read(payload, ActionSection::Snapshot), header.bytes));
             }

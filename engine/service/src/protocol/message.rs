@@ -5,6 +5,7 @@
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym_core::batch::{Block, LAYOUT_VERSION};
+use endless_gym_core::pool::EnvReset;
 use endless_gym_core::printable;
 use iceoryx2::prelude::ZeroCopySend;
 
@@ -125,6 +126,24 @@ pub(crate) struct RequestHeader {
     pub process: u32,
     /// Batches of the group that the trainer holds, for people.
     pub held: u32,
+}
+
+/// The items of the sections `reset` and `seed` of a request.
+pub(crate) fn encode_reset(reset: EnvReset) -> (u8, u64) {
+    match reset {
+        EnvReset::Keep => (0, 0),
+        EnvReset::Next => (1, 0),
+        EnvReset::Seed(seed) => (2, seed),
+    }
+}
+
+/// The reset of these items.
+pub(crate) fn decode_reset(reset: u8, seed: u64) -> EnvReset {
+    match reset {
+        0 => EnvReset::Keep,
+        1 => EnvReset::Next,
+        _ => EnvReset::Seed(seed),
+    }
 }
 
 /// Status of a response that holds a batch.
