@@ -42,8 +42,13 @@ def generalised_advantages(
 
 
 def normalised(advantages: Tensor, reference: Tensor | None = None) -> Tensor:
-    """Scale advantages of any shape so that `reference`, by default `advantages`, has mean 0 and standard deviation 1."""
+    """Scale advantages of any shape so that `reference`, by default `advantages`, has mean 0 and standard deviation 1.
+
+    A reference of one step has no standard deviation; the advantages then stay as they are.
+    """
     reference = advantages if reference is None else reference
+    if reference.numel() < 2:
+        return advantages
     return (advantages - reference.mean()) / (reference.std() + 1e-8)
 
 
@@ -95,5 +100,7 @@ def ground_truth_loss(estimates: Tensor, truth: Tensor) -> Tensor:
 
 def explained_variance(values: Tensor, returns: Tensor) -> Tensor:
     """Fraction of the variance of `returns` that `values`, of the same shape, explain; NaN if the returns have no variance."""
+    if returns.numel() < 2:
+        return returns.new_tensor(float("nan"))
     variance = returns.var()
     return (1.0 - (returns - values).var() / variance).masked_fill(variance == 0, float("nan"))

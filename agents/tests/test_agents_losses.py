@@ -39,6 +39,12 @@ def test_advantages_are_discounted_sums_of_td_errors(steps: int) -> None:
             assert float(advantages[start, env]) == pytest.approx(total, abs=1e-5)
 
 
+def test_one_advantage_is_not_normalised() -> None:
+    one, two = torch.tensor([[3.0]]), torch.tensor([1.0, 3.0])
+    assert losses.normalised(one).equal(one) and losses.normalised(two, one).equal(two)
+    assert losses.normalised(two).tolist() == pytest.approx([-(0.5**0.5), 0.5**0.5])
+
+
 def test_advantages_of_long_segments_take_few_operations() -> None:
     steps, envs = 512, 2
     rewards, values, last = torch.randn(steps, envs), torch.randn(steps, envs), torch.randn(envs)
@@ -53,6 +59,7 @@ def test_explained_variance_is_1_for_equal_values_and_nan_without_variance() -> 
     assert losses.explained_variance(torch.zeros(3), returns) == 0.0
     assert losses.explained_variance(returns / 2, returns) == pytest.approx(0.75)
     assert math.isnan(losses.explained_variance(returns, torch.ones(3)))
+    assert math.isnan(losses.explained_variance(returns[:1], returns[:1]))
 
 
 def test_coefficients_decay_linearly_to_their_final_value() -> None:

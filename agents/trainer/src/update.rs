@@ -95,7 +95,7 @@ impl Learner {
                 let parts_count = parts.len();
                 let steps: usize = minibatch.iter().map(|sequence| sequence.length).sum();
                 let normal = match ppo.advantage_normalisation {
-                    Scope::Minibatch => moments_of(&minibatch, num_envs, &targets.advantages),
+                    Scope::Minibatch => scale_of(&minibatch, num_envs, &targets.advantages),
                     Scope::None | Scope::Batch => (0.0, 1.0),
                 };
                 for (shard, sequences) in self.shards.iter_mut().zip(parts) {
@@ -253,7 +253,7 @@ fn generalised_advantages(segment: &Segment, num_envs: usize, gamma: f64, gae_la
     advantages
 }
 
-/// Mean and standard deviation, with Bessel's correction as PyTorch's.
+/// Mean and standard deviation, with Bessel's correction as PyTorch's: NaN for a single number.
 fn moments(numbers: &[f32]) -> (f64, f64) {
     let count = numbers.len() as f64;
     let mean = numbers.iter().map(|x| f64::from(*x)).sum::<f64>() / count;
@@ -261,17 +261,25 @@ fn moments(numbers: &[f32]) -> (f64, f64) {
     (mean, (squares / (count - 1.0)).sqrt())
 }
 
-/// What normalises the advantages of a minibatch: the mean, and the deviation plus 1e-8.
-fn moments_of(minibatch: &[Sequence], num_envs: usize, advantages: &[f32]) -> (f32, f32) {
+/// What normalises advantages: their mean, and their standard deviation plus 1e-8. A single one stays as it is.
+fn scale(advantages: &[f32]) -> (f64, f64) {
+    if advantages.len() < 2 {
+        return (0.0, 1.0);
+    }
+    let (mean, deviation) = moments(advantages);
+    (mean, deviation + 1e-8)
+}
+
+/// What normalises the advantages of a minibatch.
+fn scale_of(minibatch: &[Sequence], num_envs: usize, advantages: &[f32]) -> (f32, f32) {
     let rows = minibatch.iter().flat_map(|s| (s.start..s.start + s.length).map(|step| step * num_envs + s.env));
-    let chosen: Vec<f32> = rows.map(|row| advantages[row]).collect();
-    let (mean, deviation) = moments(&chosen);
-    (mean as f32, (deviation + 1e-8) as f32)
+    let (mean, deviation) = scale(&rows.map(|row| advantages[row]).collect::<Vec<f32>>());
+    (mean as f32, deviation as f32)
 }
 
 fn normalise(advantages: &mut [f32]) {
-    let (mean, deviation) = moments(advantages);
-    advantages.iter_mut().for_each(|a| *a = ((f64::from(*a) - mean) / (deviation + 1e-8)) as f32);
+    let (mean, deviation) = scale(advantages);
+    advantages.iter_mut().for_each(|a| *a = ((f64::from(*a) - mean) / deviation) as f32);
 }
 
 /// Fraction of the variance of the returns that the values explain; NaN if the returns have no variance.

@@ -313,6 +313,19 @@ fn errors_say_what_is_allowed_and_leave_nothing() {
     }
 }
 
+#[test]
+fn a_minibatch_of_one_step_learns() {
+    let folder = Folder::new("one-step");
+    for scope in ["minibatch", "batch", "none"] {
+        // A segment of one step is one minibatch.
+        let sizes = "--environment.num-envs 1 --ppo.steps 1 --ppo.minibatches 1 --recurrence.sequence-length 1";
+        let run = folder.run(scope, &format!("{sizes} --ppo.advantage-normalisation {scope}"));
+        let rows = progress(&run);
+        assert_eq!(rows.len(), 4);
+        assert!(rows.iter().all(|row| row["gradient_norm"].as_f64() > Some(0.0)), "{rows:?}");
+    }
+}
+
 /// Changes the header and the bytes of the tensors of a checkpoint. Without `keeps_checksum` it has none, as weights of other programs.
 fn forge(file: &Path, header: impl Fn(&mut Json), bytes: impl Fn(&str, &mut Vec<u8>), keeps_checksum: bool) {
     let content = fs::read(file).unwrap();

@@ -307,7 +307,8 @@ def learn(agent: Agent, optimizer: torch.optim.Optimizer, batch: dict[str, torch
         current = log_prob_of([Categorical(logits=head.logits[:-1]) for head in heads], batch["action"])
         ratio = (current - batch["log_prob"]).exp()
         targets, advantages = v_trace(values, batch["reward"], goes_on, ratio, args)
-        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        if advantages.numel() > 1:  # one step has no standard deviation
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     for _ in range(args.update_epochs):
         for mb in torch.randperm(obs.shape[1], device=obs.device).chunk(args.num_minibatches):
             heads, newvalue, _ = agent(obs[:-1, mb], first[:-1, mb], state[:, mb])

@@ -167,7 +167,8 @@ if __name__ == "__main__":
                 )
                 ratio = (newlogprob - logprobs[:, mb].flatten()).exp()
                 mb_advantages = advantages[:, mb].flatten()
-                mb_advantages = (mb_advantages - mb_advantages.mean()) / (mb_advantages.std() + 1e-8)
+                if len(mb_advantages) > 1:  # one step has no standard deviation
+                    mb_advantages = (mb_advantages - mb_advantages.mean()) / (mb_advantages.std() + 1e-8)
                 clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
                 pg_loss = -torch.min(mb_advantages * ratio, mb_advantages * clipped).mean()
                 v_loss = 0.5 * (newvalue - returns[:, mb].flatten()).square().mean()

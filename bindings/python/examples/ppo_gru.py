@@ -270,7 +270,9 @@ class Trainer:
                 old = {name: batch[name][:, envs].flatten(0, 1)[valid] for name in ("actions", "log_prob", "value")}
                 log_probs, value = [each[valid] for each in log_probs], value[valid]
                 advantage, target = (each[:, envs].flatten()[valid] for each in (advantages, returns))
-                advantage = ((advantage - advantage.mean()) / (advantage.std() + 1e-8)).unsqueeze(1)
+                if len(advantage) > 1:  # one step has no standard deviation
+                    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+                advantage = advantage.unsqueeze(1)
                 ratio = (chosen_log_probs(log_probs, old["actions"]) - old["log_prob"]).exp()
                 clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
                 policy_loss = -torch.min(ratio * advantage, clipped * advantage).mean()
@@ -328,6 +330,8 @@ def main() -> None:
     args.run.mkdir(parents=True, exist_ok=True)
     if not args.resume and (args.run / "last.pt").exists():
         raise SystemExit(f"{args.run} has a run; add --resume, or choose another --run")
+    if args.num_steps < 2 and args.autoreset == "next_step":
+        raise SystemExit("--num-steps must be at least 2, since one step may only reset an environment")
     trainer = Trainer(args)
     if args.resume:
         trainer.load()

@@ -138,6 +138,23 @@ def test_cleanrl_ppo(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "example",
+    [
+        "cleanrl_ppo.py --num-envs 2 --num-minibatches 2 --num-steps 1 --total-timesteps 4",
+        "ppo_gru.py --num-envs 2 --num-minibatches 2 --num-steps 1 --total-timesteps 4 --autoreset same_step",
+        # After the end of an episode, one of two steps is masked.
+        "ppo_gru.py --num-envs 2 --num-minibatches 2 --num-steps 2 --total-timesteps 400 --autoreset next_step",
+        "asynchronous_actors.py --actors 1 --num-envs 1 --batch-trajectories 1 --num-steps 1 --total-timesteps 4",
+    ],
+)
+def test_a_minibatch_of_one_step_is_finite(tmp_path, example):
+    script, *arguments = example.split()
+    output, _ = run(script, tmp_path, *arguments, "--env-id", "MortarMayhem-Grid-v0", "--hidden-size", "8")
+    losses = [float(loss) for loss in re.findall(r"loss=(\S+)", output)]
+    assert losses and all(math.isfinite(loss) for loss in losses)
+
+
+@pytest.mark.parametrize(
     ("env_id", "observation", "runners", "memory"),
     [
         ("Endless-MortarMayhem-v0", "rgb", 1, "lstm"),
