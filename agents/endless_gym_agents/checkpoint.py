@@ -15,13 +15,14 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_tensors
 
 from endless_gym.specs import spec
 from endless_gym_agents import atomic, ranges, regular
@@ -31,6 +32,9 @@ from endless_gym_agents.settings import Settings, Transformer, from_dict
 
 #: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
 CHECKPOINT_VERSION = 1
+
+#: Versions of the files of `endless learn` and of exported agents that can be read; the last one is written.
+FILE_VERSIONS = (1, 2)
 
 #: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it. Checkpoints of
 #: `endless learn`, the trainer in Rust, end with `RUST_SUFFIX` instead.
@@ -157,14 +161,15 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         raise FileNotFoundError(
             f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
         )
+    versions: tuple[int, ...] = (CHECKPOINT_VERSION,)
     if file.suffix == RUST_SUFFIX:
-        state = _read_of_rust(file)
+        state, versions = _read_of_rust(file), FILE_VERSIONS
     else:
         with regular.opened(file) as content:
             state = _read(content, file)
-    if (version := state.get("version")) != CHECKPOINT_VERSION:
+    if (version := state.get("version")) not in versions:
         raise ValueError(
-            f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; "
+            f"checkpoint {file} must be of version {' or '.join(map(str, versions))}, got {version}; "
             "use the version of endless-gym that wrote it"
         )
     if missing := [name for name in ("settings", "update", "steps", "model") if name not in state]:
@@ -224,22 +229,47 @@ def _read_of_rust(file: Path) -> dict[str, Any]:
     try:
         with safe_open(file, "pt") as content:
             metadata = content.metadata() or {}
-            tensors = {name: content.get_tensor(name) for name in sorted(content.keys())}
+            tensors = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(f"{file} is not a file of safetensors, or is truncated: {error}") from error
     if "endless" not in metadata:
         raise ValueError(f"{file} is not a checkpoint of `endless learn`: it has weights only")
     try:
-        checksum = zlib.crc32(metadata["endless"].encode())
-        for name, tensor in tensors.items():
-            checksum = zlib.crc32(tensor.numpy().tobytes(), zlib.crc32(name.encode(), checksum))
-        if metadata.get("crc32", f"{checksum:08x}") != f"{checksum:08x}":
-            raise ValueError("its checksum differs")
         header = json.loads(metadata["endless"])
         state = {name: header[name] for name in ("version", "settings", "update", "steps")}
+        version, has_checksum = state["version"], "crc32" in metadata or state["version"] != 1
+        expected = _checksum(version, metadata["endless"], tensors) if version in FILE_VERSIONS else ""
+        if expected and has_checksum and metadata.get("crc32") != expected:
+            raise ValueError("its checksum differs")
+        model = {name: tensor for name, tensor in tensors.items() if not name.startswith("state/")}
+        if other := [f"{tensor.dtype} in {name}" for name, tensor in model.items() if tensor.dtype != torch.float32]:
+            raise ValueError(f"its weights must be float32, got {other[0]}")
     except (KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"checkpoint {file} is damaged: {error}") from error
-    return state | {"model": {name: tensor for name, tensor in tensors.items() if not name.startswith("state/")}}
+    return state | {"model": model}
+
+
+def to_safetensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any] | None = None) -> bytes:
+    """A file of an agent, as docs/train/rust.md describes it.
+
+    Args:
+        tensors: Weights by name, float32, on the CPU and contiguous.
+        header: The header without its version, which is added; `None` for a file of weights alone.
+    """
+    version = FILE_VERSIONS[-1]
+    text = "" if header is None else json.dumps({"version": version, **header}, separators=(",", ":"))
+    metadata = {"crc32": _checksum(version, text, tensors)} | ({"endless": text} if text else {})
+    return save_tensors(dict(tensors), metadata)
+
+
+def _checksum(version: int, header: str, tensors: Mapping[str, torch.Tensor]) -> str:
+    """As in the crate `endless-gym-kernels`, which defines it."""
+    names = {torch.float32: "F32", torch.uint8: "U8", torch.uint64: "U64"}
+    total = zlib.crc32(header.encode())
+    for name, tensor in sorted(tensors.items()):
+        described = f"{name} {names.get(tensor.dtype)} {list(tensor.shape)}" if version > 1 else name
+        total = zlib.crc32(tensor.numpy().tobytes(), zlib.crc32(described.encode(), total))
+    return f"{total:08x}"
 
 
 def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Settings]:

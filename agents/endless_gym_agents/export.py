@@ -6,9 +6,9 @@ python -m endless_gym_agents.export runs/mine --weights mine.safetensors        
 python -m endless_gym_agents.export mine.safetensors --vectors mine.json   # outputs of the network, for tests of other programs
 ```
 
-The file is in the format safetensors, with the names and shapes of PyTorch's `state_dict`. The entry `endless` of its metadata is
-JSON: settings and length of the training, as in a checkpoint of `endless learn`, and the measured success. The weights are
-rounded to bfloat16, so that browsers download half as many bytes after compression. `checkpoint.load` reads the file.
+The file is in the format of a checkpoint of `endless learn`; its header has settings and length of the training, and the measured
+success. The weights are rounded to bfloat16, so that browsers download half as many bytes after compression. `checkpoint.load`
+reads the file.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from typing import Any
 
 import torch
 import tyro
-from safetensors.torch import save
 
 from endless_gym.create import make_vec
 from endless_gym.printable import printable
 from endless_gym.specs import spec
 from endless_gym_agents import atomic, command
 from endless_gym_agents.agent import Agent
-from endless_gym_agents.checkpoint import CHECKPOINT_VERSION, Checkpoint, load, protected
+from endless_gym_agents.checkpoint import Checkpoint, load, protected, to_safetensors
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.metrics import TASK_PROGRESS
 from endless_gym_agents.ranges import Positive
@@ -64,14 +63,13 @@ def export(checkpoint: Checkpoint, evaluation: list[dict[str, Any]]) -> bytes:
         evaluation: What `evaluations` returned for it.
     """
     header = {
-        "version": CHECKPOINT_VERSION,
         "update": checkpoint.update,
         "steps": checkpoint.steps,
         "evaluation": evaluation,
         # The folder of the run is a path on the training machine.
         "settings": to_dict(checkpoint.settings) | {"run": "", "resume": ""},
     }
-    return save(weights(checkpoint.agent), {"endless": json.dumps(header, separators=(",", ":"))})
+    return to_safetensors(weights(checkpoint.agent), header)
 
 
 def weights(agent: Agent) -> dict[str, torch.Tensor]:
@@ -167,7 +165,7 @@ def execute(arguments: ExportArguments) -> None:
     checkpoint = load(arguments.source)
     agent = checkpoint.agent
     if arguments.weights is not None:
-        atomic.write(arguments.weights, save(weights(agent)))
+        atomic.write(arguments.weights, to_safetensors(weights(agent)))
     if arguments.out is not None or arguments.vectors is not None:
         check(agent.settings, agent)
     if arguments.out is not None:

@@ -4,6 +4,9 @@ import errno
 import json
 import os
 import resource
+import struct
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +63,71 @@ def test_an_exported_agent_is_read_back(tmp_path: Path) -> None:
     assert export.record_vectors(read.agent, 40) == export.record_vectors(loaded.agent, 40)
     exported = read.agent.state_dict()
     assert all(torch.equal(tensor, exported[name]) for name, tensor in loaded.agent.state_dict().items())
+
+
+def described(content: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
+    """A file with its description, the JSON text of the format, changed."""
+    length = 8 + int.from_bytes(content[:8], "little")
+    description = json.loads(content[8:length])
+    change(description)
+    text = json.dumps(description, separators=(",", ":")).encode()
+    return struct.pack("<Q", len(text)) + text + content[length:]
+
+
+def changes(content: bytes) -> Iterator[tuple[str, bytes]]:
+    """The file with each part of its description, or a bit of the data, changed."""
+    yield "data", content[:-1] + bytes([content[-1] ^ 1])
+    name, entry = (
+        "encoder.vector.0.weight",
+        json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["encoder.vector.0.weight"],
+    )
+    for dtype in ("I32", "U32", "BF16", "F64"):
+        yield dtype, described(content, lambda all, given=dtype: all[name].update(dtype=given))
+    for shape in (entry["shape"][::-1], [], [entry["shape"][0] * entry["shape"][1]]):
+        yield str(shape), described(content, lambda all, given=shape: all[name].update(shape=given))
+    yield "offsets", described(content, lambda all: all[name].update(data_offsets=[0, 4]))
+    yield "name", described(content, lambda all: all.update({"other": all.pop(name)}))
+    for part in ("endless", "crc32"):
+        yield f"no {part}", described(content, lambda all, key=part: all["__metadata__"].pop(key))
+        yield part, described(content, lambda all, key=part: all["__metadata__"].update({key: "12345678"}))
+    header = json.loads(json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]["endless"])
+    for key, value in header.items():
+        for other in ({key: 1 if value != 1 else 2}, {key: 3}, {f"{key}.": value}):
+            text = json.dumps({each: header[each] for each in header if each != key} | other)
+            yield f"{key} {other}", described(content, lambda all, text=text: all["__metadata__"].update(endless=text))
+
+
+@pytest.mark.parametrize("file", FILES[:1], ids=lambda file: file.stem)
+def test_a_file_with_any_part_changed_is_refused(file: Path, tmp_path: Path) -> None:
+    content, other = file.read_bytes(), tmp_path / "other.safetensors"
+    other.write_bytes(described(content, lambda all: all))
+    assert checkpoint.load(other).update == checkpoint.load(file).update
+    for what, damaged in changes(content):
+        other.write_bytes(damaged)
+        with pytest.raises(ValueError, match="safetensors"):
+            checkpoint.load(other)
+            pytest.fail(f"{what} is read")
+
+
+def test_older_files_are_read_unless_their_weights_have_another_type(tmp_path: Path) -> None:
+    """Files of version 1 have no checksum, as exported agents, or one without types and shapes, as those of `endless learn`."""
+    content, older = FILES[0].read_bytes(), tmp_path / "older.safetensors"
+    with safe_open(FILES[0], "pt") as opened:
+        text = json.dumps(header(FILES[0]) | {"version": 1})
+        total = zlib.crc32(text.encode())
+        for name in sorted(opened.keys()):
+            total = zlib.crc32(opened.get_tensor(name).numpy().tobytes(), zlib.crc32(name.encode(), total))
+    for metadata in ({"endless": text}, {"endless": text, "crc32": f"{total:08x}"}):
+        given = described(content, lambda all, given=metadata: all.update(__metadata__=given))
+        older.write_bytes(given)
+        assert checkpoint.load(older).update == checkpoint.load(FILES[0]).update
+        for dtype in ("I32", "U32"):
+            older.write_bytes(given.replace(b'"dtype":"F32"', f'"dtype":"{dtype}"'.encode(), 1))
+            with pytest.raises(ValueError, match=r"weights must be float32, got torch\.u?int32 in"):
+                checkpoint.load(older)
+    older.write_bytes(given[:-1] + bytes([given[-1] ^ 1]))
+    with pytest.raises(ValueError, match="its checksum differs"):
+        checkpoint.load(older)
 
 
 def test_agents_that_the_page_cannot_compute_are_refused(tmp_path: Path) -> None:

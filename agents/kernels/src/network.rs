@@ -15,15 +15,6 @@ use crate::matrix::{Matrix, Packed};
 use crate::sequences::Sequences;
 use crate::{gru, mingru};
 
-/// Longest header of a file of weights in the format safetensors, in bytes: far more than a network needs, and few enough to read at once.
-const MAX_HEADER: u64 = 4 << 20;
-
-/// Whether a file in the format safetensors has a header that a network can have. The format itself allows a million tensors, which take
-/// seconds to read.
-pub fn has_short_header(file: &[u8]) -> bool {
-    file.first_chunk().is_some_and(|length| u64::from_le_bytes(*length) <= MAX_HEADER)
-}
-
 /// Kinds and sizes of the layers.
 #[derive(Clone, Debug)]
 pub struct NetworkSpec {

@@ -1,14 +1,15 @@
 //! Checkpoints: the state from which a run resumes exactly, in the format safetensors.
 //!
 //! The weights have their names and shapes in PyTorch's `state_dict`, so that any reader of the format finds them. The other tensors
-//! begin with `state/`, and the rest is JSON text in the entry `endless` of the metadata. The random numbers need no state: each update
-//! has a generator of its own. A checksum of all of it, in the entry `crc32`, detects damage, which the format does not.
+//! begin with `state/`, and the rest is in the header of the [`file`](mod@endless_gym_kernels::file). The random numbers need no state: each
+//! update has a generator of its own.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use endless_gym_core::files;
 use endless_gym_kernels::adamw::AdamW;
+use endless_gym_kernels::file::{self as agent_file, VERSION};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 
@@ -16,13 +17,8 @@ use crate::error::{Error, file};
 use crate::metrics::Episode;
 use crate::rollout::State;
 use crate::settings::{Agent, Settings};
-use endless_gym_kernels::network::{Network, Tensor, has_short_header};
+use endless_gym_kernels::network::{Network, Tensor};
 
-/// Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed.
-const VERSION: u32 = 1;
-/// Entries of the metadata: the header, and the checksum.
-const METADATA: &str = "endless";
-const CHECKSUM: &str = "crc32";
 /// Names in the folder of a run: the folder of the checkpoints, and the last checkpoint in it.
 const FOLDER: &str = "checkpoints";
 const LAST: &str = "last.safetensors";
@@ -30,19 +26,6 @@ const LAST: &str = "last.safetensors";
 /// Largest numbers of updates and of steps that a header may claim: far more than any run has, and far from an overflow.
 const MAX_UPDATES: i32 = 1 << 30;
 const MAX_STEPS: u64 = 1 << 53;
-
-/// The checksum of a header and of tensors in the order of their names.
-fn checksum<'a>(header: &str, tensors: impl Iterator<Item = (&'a str, &'a [u8])>) -> String {
-    let mut tensors: Vec<_> = tensors.collect();
-    tensors.sort_unstable();
-    let mut sum = crc32fast::Hasher::new();
-    sum.update(header.as_bytes());
-    for (name, bytes) in tensors {
-        sum.update(name.as_bytes());
-        sum.update(bytes);
-    }
-    format!("{:08x}", sum.finalize())
-}
 
 /// What a checkpoint holds besides numbers.
 #[derive(Serialize, Deserialize)]
@@ -72,7 +55,7 @@ pub fn save(
     let (mean, square, optimizer_updates) = optimizer.state();
     let episodes = state.episodes.iter().cloned().collect();
     let header = Header { version: VERSION, update, steps, optimizer_updates, episodes, settings: settings.clone() };
-    let header = serde_json::to_string(&header).map_err(Error::json(METADATA))?;
+    let header = serde_json::to_string(&header).map_err(Error::json("the header"))?;
     let lengths: Vec<u64> = state.snapshots.iter().map(|snapshot| snapshot.len() as u64).collect();
     let (snapshots, starts) =
         (state.snapshots.concat(), state.starts.iter().map(|start| u8::from(*start)).collect::<Vec<_>>());
@@ -97,12 +80,10 @@ pub fn save(
     let tensors: Vec<_> = weights.chain(hidden).chain(others).collect();
     let views = tensors
         .iter()
-        .map(|(name, dtype, shape, bytes)| Ok((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?)));
+        .map(|(name, dtype, shape, bytes)| Ok((name.clone(), TensorView::new(*dtype, shape.clone(), bytes)?)));
     let wrong = |error: safetensors::SafeTensorError| Error::Checkpoint { path: last.clone(), what: error.to_string() };
     let views = views.collect::<Result<Vec<_>, _>>().map_err(wrong)?;
-    let sum = checksum(&header, tensors.iter().map(|(name, _, _, bytes)| (&**name, &**bytes)));
-    let metadata = [(METADATA.to_owned(), header), (CHECKSUM.to_owned(), sum)].into_iter().collect();
-    let content = safetensors::serialize(views, Some(metadata)).map_err(wrong)?;
+    let content = agent_file::write(header, views).map_err(wrong)?;
 
     let write = || {
         fs::create_dir_all(&folder)?;
@@ -145,31 +126,17 @@ impl Checkpoint {
         Error::Checkpoint { path: self.path.clone(), what: what.into() }
     }
 
-    /// The tensors and the text of the header. Files of weights from other programs have neither header nor checksum.
+    /// The tensors and the text of the header, which files of weights lack.
     fn tensors(&self) -> Result<(SafeTensors<'_>, Option<String>), Error> {
-        if !has_short_header(&self.content) {
-            return Err(self.wrong("is not a file of safetensors, or has far more tensors than a network"));
-        }
-        let damaged = |error| self.wrong(format!("is damaged: {error}"));
-        let tensors = SafeTensors::deserialize(&self.content).map_err(damaged)?;
-        let metadata = SafeTensors::read_metadata(&self.content).map_err(damaged)?.1;
-        let entry = |name: &str| metadata.metadata().as_ref().and_then(|entries| entries.get(name)).cloned();
-        let header = entry(METADATA);
-        let sum = checksum(header.as_deref().unwrap_or_default(), tensors.iter().map(|(name, t)| (name, t.data())));
-        if entry(CHECKSUM).is_some_and(|expected| expected != sum) {
-            return Err(self.wrong("is damaged: its checksum differs"));
-        }
-        Ok((tensors, header))
+        let read = agent_file::read(&self.content).map_err(|error| self.wrong(error.to_string()))?;
+        Ok((read.tensors, read.header))
     }
 
     /// The header, which only a checkpoint of a run has.
     fn header(&self, text: Option<String>) -> Result<Header, Error> {
         let text = text.ok_or_else(|| self.wrong("cannot be resumed, as it has weights only; use --init-from"))?;
         let header: Header = serde_json::from_str(&text).map_err(Error::json(self.path.display()))?;
-        let Header { version, update, steps, optimizer_updates, .. } = header;
-        if version != VERSION {
-            return Err(self.wrong(format!("must be of version {VERSION}, got {version}")));
-        }
+        let Header { update, steps, optimizer_updates, .. } = header;
         if update > MAX_UPDATES as u64 || steps > MAX_STEPS || !(0..=MAX_UPDATES).contains(&optimizer_updates) {
             let given = format!("{update} updates, {optimizer_updates} of the optimizer, and {steps} steps");
             return Err(self.wrong(format!("cannot be resumed, as it claims {given}")));

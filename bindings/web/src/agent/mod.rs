@@ -7,16 +7,15 @@ mod tests;
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::random::{Generator, SeedSequence};
 use endless_gym_kernels::categorical;
-use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass, has_short_header};
+use endless_gym_kernels::file::{self, File, FileError};
+use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass};
 use endless_gym_kernels::sequences::Sequences;
 use linear_attention::{Kind, Sizes, Stack, State};
-use safetensors::{Dtype, SafeTensorError, SafeTensors};
+use safetensors::{Dtype, SafeTensors};
 use serde::Deserialize;
 use serde_json::{Map, Value as Json, json};
 use thiserror::Error;
 
-/// The entry of a file's metadata.
-const METADATA: &str = "endless";
 /// Largest size of a layer, and number of recurrent layers. With these, the number of weights fits into 32 bits.
 const MAX_SIZE: usize = 4096;
 const MAX_LAYERS: usize = 16;
@@ -24,14 +23,10 @@ const MAX_LAYERS: usize = 16;
 /// A file that is not an agent, or one that cannot act.
 #[derive(Debug, Error)]
 pub enum AgentFileError {
-    #[error("the file must be an exported agent in the format safetensors: {0}")]
-    Format(#[from] SafeTensorError),
-    #[error(
-        "the file of an agent must be in the format safetensors, and must not have far more tensors than a network"
-    )]
-    Size,
-    #[error("the file of an agent must have the entry `{METADATA}` of its metadata; export the agent again")]
-    Metadata,
+    #[error("the file of the agent {0}")]
+    File(#[from] FileError),
+    #[error("the file has weights only; export the agent with --out, or open a checkpoint of `endless learn`")]
+    WeightsOnly,
     #[error("the header of an agent cannot be read: {0}")]
     Header(#[from] serde_json::Error),
     #[error("an agent on the page must be gru, mingru, gated-deltanet, mamba2, retnet or none, got {given}")]
@@ -47,7 +42,7 @@ pub enum AgentFileError {
     NotFinite { name: String, given: f32 },
 }
 
-/// The metadata of a file.
+/// The header of a file.
 #[derive(Debug, Deserialize)]
 struct Header {
     update: u64,
@@ -94,13 +89,8 @@ pub struct Memory {
 impl Agent {
     /// Reads the file of an agent.
     pub fn read(file: &[u8]) -> Result<Self, AgentFileError> {
-        if !has_short_header(file) {
-            return Err(AgentFileError::Size);
-        }
-        let tensors = SafeTensors::deserialize(file)?;
-        let metadata = SafeTensors::read_metadata(file)?.1;
-        let text = metadata.metadata().as_ref().and_then(|entries| entries.get(METADATA));
-        let header: Header = serde_json::from_str(text.ok_or(AgentFileError::Metadata)?)?;
+        let File { tensors, header } = file::read(file)?;
+        let header: Header = serde_json::from_str(&header.ok_or(AgentFileError::WeightsOnly)?)?;
         let spec = network_spec(&header.settings, &tensors)?;
         let network = Network::new(spec, |tensor| weights(&tensors, &tensor.name, &tensor.shape))?;
         let stack = kind(&header.settings).map(|kind| stack(kind, &network.spec, &tensors)).transpose()?;

@@ -131,29 +131,42 @@ fn an_agent_fits_only_its_environment() {
     assert_eq!(fitting, ["MortarMayhem-Grid-v0"]);
 }
 
+/// The file of an agent of version 1, without a checksum.
+fn without_checksum(file: &[u8]) -> Vec<u8> {
+    let File { tensors, header } = file::read(file).unwrap();
+    let header = header.unwrap().replacen("\"version\":2", "\"version\":1", 1);
+    let metadata = [("endless".to_owned(), header)].into_iter().collect();
+    safetensors::serialize(tensors.iter(), Some(metadata)).unwrap()
+}
+
 #[test]
 fn a_broken_file_is_refused() {
     let refused = |file: &[u8]| Agent::read(file).map(drop).unwrap_err();
+    assert!(matches!(refused(b"PK no agent"), AgentFileError::File(FileError::Format(_))));
+    assert!(matches!(refused(&[AGENT, b"more"].concat()), AgentFileError::File(FileError::Format(_))));
+    // Every prefix is refused without a panic.
+    for length in (0..AGENT.len()).step_by(97).chain([7, 8, AGENT.len() - 1]) {
+        assert!(matches!(refused(&AGENT[..length]), AgentFileError::File(FileError::Format(_))), "{length}");
+    }
+    // The sign of the last weight.
+    let damaged = [&AGENT[..AGENT.len() - 1], &[AGENT[AGENT.len() - 1] ^ 128]].concat();
+    assert_eq!(refused(&damaged).to_string(), "the file of the agent is damaged: its checksum differs");
+    let older = without_checksum(AGENT);
+    assert!(Agent::read(&older).is_ok());
     let with = |start: usize, bytes: &[u8]| {
-        let mut file = AGENT.to_vec();
+        let mut file = older.clone();
         file[start..start + bytes.len()].copy_from_slice(bytes);
         file
     };
-    assert!(matches!(refused(b"PK no agent"), AgentFileError::Format(_)));
-    assert!(matches!(refused(&[AGENT, b"more"].concat()), AgentFileError::Format(_)));
-    let nan = refused(&with(AGENT.len() - 4, &f32::NAN.to_le_bytes()));
+    let nan = refused(&with(older.len() - 4, &f32::NAN.to_le_bytes()));
     assert!(matches!(nan, AgentFileError::NotFinite { given, .. } if given.is_nan()), "{nan}");
-    // Every prefix is refused without a panic.
-    for length in (0..AGENT.len()).step_by(97).chain([7, 8, AGENT.len() - 1]) {
-        assert!(matches!(refused(&AGENT[..length]), AgentFileError::Format(_)), "{length}");
-    }
     // Other names, kinds and shapes.
     let replaced = |from: &str, to: &str| {
         assert_eq!(from.len(), to.len());
-        let at = AGENT.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
+        let at = older.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
         refused(&with(at, to.as_bytes()))
     };
-    assert!(matches!(replaced("\"endless\"", "\"nothing\""), AgentFileError::Metadata));
+    assert!(matches!(replaced("\"endless\"", "\"nothing\""), AgentFileError::WeightsOnly));
     assert!(matches!(replaced(r#"\"steps\":"#, r#"\"stops\":"#), AgentFileError::Header(_)));
     let kind = replaced(r#"\"agent\":\"gru\""#, r#"\"agent\":\"abc\""#);
     assert_eq!(
@@ -171,7 +184,7 @@ fn a_damaged_file_is_refused_or_plays() {
     let draws = &mut Generator::from_seed(35);
     let stacks =
         ["gated-deltanet", "mamba2", "retnet"].map(|name| std::fs::read(format!("tests/agents/{name}.safetensors")));
-    let mut files = vec![AGENT.to_vec()];
+    let mut files = vec![without_checksum(AGENT)];
     files.extend(stacks.map(Result::unwrap));
     // The last one is empty.
     let words = r#"0 -1 4096 1e400 18446744073709551615 null [] { " \ F64 [[[[ gru retnet "#;

@@ -135,7 +135,10 @@ fn only_environments_with_an_agent_offer_it() {
     assert_eq!(browser.complaints, Vec::<String>::new());
     // A broken or missing file is reported, and the person keeps playing.
     let failing = "globalThis.fetch = async () => new Response(new Uint8Array([80, 75]), { status: STATUS })";
-    for (status, message) in [("200", "the file must be an exported agent"), ("404", "cannot be loaded: 404")] {
+    for (status, message) in [
+        ("200", "the file of the agent is damaged: it must be in the format safetensors"),
+        ("404", "cannot be loaded: 404"),
+    ] {
         visit(&mut browser, &server, &format!("env={ID}&seed=1"));
         browser.value(&format!("{}; 0", failing.replace("STATUS", status)));
         browser.press("KeyG");

@@ -1,0 +1,111 @@
+//! Files of agents: the format safetensors with a header and a checksum. "Files of agents" in `docs/train/rust.md` describes them.
+
+use std::fmt::Write as _;
+
+use safetensors::tensor::{SafeTensorError, SafeTensors, TensorView};
+use serde::Deserialize;
+use thiserror::Error;
+
+/// Version of the files that [`write`] makes. The checksum of version 1 leaves out dtypes and shapes, and may be missing.
+pub const VERSION: u32 = 2;
+/// Entries of the metadata.
+const HEADER: &str = "endless";
+const CHECKSUM: &str = "crc32";
+/// Longest description of the tensors in bytes, far more than a network needs. The format itself allows a million tensors, which take
+/// seconds to read.
+const MAX_DESCRIPTION: u64 = 4 << 20;
+
+/// Why a file cannot be read; the text says it of the file.
+#[derive(Debug, Error)]
+pub enum FileError {
+    /// The format is another, or a part is missing.
+    #[error("is damaged: it must be in the format safetensors: {0}")]
+    Format(#[from] SafeTensorError),
+    /// There are more tensors than a network has.
+    #[error(
+        "is damaged, or has far more tensors than a network: their description has {given} bytes of at most {MAX_DESCRIPTION}"
+    )]
+    Tensors {
+        /// Bytes of the description.
+        given: u64,
+    },
+    /// The header is not JSON with a version.
+    #[error("is damaged: its header cannot be read: {0}")]
+    Header(#[from] serde_json::Error),
+    /// Another version of this program wrote it.
+    #[error("must be of version 1 to {VERSION}, got {given}")]
+    Version {
+        /// The version.
+        given: u32,
+    },
+    /// A byte has changed since the file was written.
+    #[error("is damaged: its checksum differs")]
+    Checksum,
+}
+
+/// The checked content of a file.
+pub struct File<'a> {
+    /// The tensors by name.
+    pub tensors: SafeTensors<'a>,
+    /// The header, JSON text; `None` in files of weights alone.
+    pub header: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct Versioned {
+    version: u32,
+}
+
+/// Reads a file. Weights of other programs have neither a header nor a checksum.
+///
+/// # Errors
+///
+/// [`FileError`] if the file is damaged or of another version.
+pub fn read(content: &[u8]) -> Result<File<'_>, FileError> {
+    match content.first_chunk().map(|length| u64::from_le_bytes(*length)) {
+        Some(given) if given > MAX_DESCRIPTION => return Err(FileError::Tensors { given }),
+        _ => {}
+    }
+    let tensors = SafeTensors::deserialize(content)?;
+    let mut entries = SafeTensors::read_metadata(content)?.1.metadata().clone().unwrap_or_default();
+    let (header, expected) = (entries.remove(HEADER), entries.remove(CHECKSUM));
+    let version = match &header {
+        Some(text) => serde_json::from_str::<Versioned>(text)?.version,
+        None => VERSION,
+    };
+    if !(1..=VERSION).contains(&version) {
+        return Err(FileError::Version { given: version });
+    }
+    let is_required = header.is_some() && version > 1;
+    let sum = || checksum(version, header.as_deref().unwrap_or_default(), tensors.tensors());
+    if expected.map_or(is_required, |expected| expected != sum()) {
+        return Err(FileError::Checksum);
+    }
+    Ok(File { tensors, header })
+}
+
+/// Makes a file with a header, which has the entry `"version"` with [`VERSION`].
+///
+/// # Errors
+///
+/// If two tensors have the same name.
+pub fn write(header: String, tensors: Vec<(String, TensorView<'_>)>) -> Result<Vec<u8>, SafeTensorError> {
+    let sum = checksum(VERSION, &header, tensors.clone());
+    let metadata = [(HEADER.to_owned(), header), (CHECKSUM.to_owned(), sum)];
+    safetensors::serialize(tensors, Some(metadata.into_iter().collect()))
+}
+
+fn checksum(version: u32, header: &str, mut tensors: Vec<(String, TensorView<'_>)>) -> String {
+    tensors.sort_unstable_by(|a, b| a.0.cmp(&b.0));
+    let mut sum = crc32fast::Hasher::new();
+    sum.update(header.as_bytes());
+    for (mut name, view) in tensors {
+        if version > 1 {
+            // Writing to a string does not fail.
+            let _ = write!(name, " {} {:?}", view.dtype(), view.shape());
+        }
+        sum.update(name.as_bytes());
+        sum.update(view.data());
+    }
+    format!("{:08x}", sum.finalize())
+}
