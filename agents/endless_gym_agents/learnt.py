@@ -13,7 +13,9 @@ SHARE = 0.9
 
 
 def learnt(spec: Spec, options: Mapping[str, Any], means: Mapping[str, float]) -> str | None:
-    """Why the task counts as learnt, for a message; `None` if it does not. Always `None` in endless environments.
+    """Why the task counts as learnt, for a message; `None` if it does not.
+
+    Always `None` in endless environments, and in Mortar Mayhem where failures are rewarded.
 
     Args:
         spec: Specification of the environment.
@@ -26,6 +28,8 @@ def learnt(spec: Spec, options: Mapping[str, Any], means: Mapping[str, float]) -
     if counts_failures(spec.id):
         # The infos count a failed last command as executed; the reward does not.
         parameters = {**spec.reset_parameters, **options}
+        if parameters["reward_command_failure"] > 0:
+            return None  # an agent that fails may reach the reward, too
         counts = [int(count) for count in parameters["command_count"]]
         commands = sum(counts) / len(counts)
         name, best = "reward", commands * parameters["reward_command_success"] + parameters["reward_episode_success"]

@@ -9,6 +9,7 @@ Task progress is 0 to 1. The final infos of an episode do not always contain it,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -87,17 +88,24 @@ def task_progress(spec: Spec, options: Mapping[str, Any], final: Mapping[str, fl
 def _commands(parameters: Mapping[str, Any], final: Mapping[str, float]) -> float:
     """Mortar Mayhem. `commands_completed` is a fraction that counts a failed last command; the reward shows whether it failed.
 
-    If `command_count` contains both n and n + 1, an episode with n + 1 commands that fails at the last one is indistinguishable
-    from a complete episode with n commands, and counts as complete.
+    If `command_count` contains both n and n + 1, an episode with n + 1 commands that fails at the last one may be
+    indistinguishable from a complete episode with n commands, and counts as complete. If failing at the last command has the
+    reward of executing it, the last command counts as failed.
     """
     share, reward = final["commands_completed"], parameters["reward_command_success"]
-    informative = reward > 0 and not parameters["reward_command_failure"] and not parameters["reward_episode_success"]
-    if share < 1 or not informative:
+    if share < 1:
         return share
-    done = round(final["reward"] / reward)
-    counts = {int(count) for count in parameters["command_count"]}
-    # Either all commands were executed, or all but the last of a longer sequence.
-    return 1.0 if done in counts else done / (done + 1)
+    failure, bonus = parameters["reward_command_failure"], parameters["reward_episode_success"]
+    counts = sorted({int(count) for count in parameters["command_count"]})
+
+    def is_return(expected: float) -> bool:
+        return math.isclose(final["reward"], expected, rel_tol=1e-6, abs_tol=1e-9)
+
+    if not math.isclose(failure, reward + bonus) and any(is_return(count * reward + bonus) for count in counts):
+        return 1.0
+    # All commands but the last one; the fewest, if several numbers have that return.
+    count = next((count for count in counts if is_return((count - 1) * reward + failure)), counts[0])
+    return (count - 1) / count
 
 
 def _tiles(parameters: Mapping[str, Any], final: Mapping[str, float], path: int) -> float:

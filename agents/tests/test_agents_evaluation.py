@@ -9,11 +9,13 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from agents_helpers import changed, settings
 from rich.console import Console
 
 import endless_gym_agents
+from endless_gym.env import Env
 from endless_gym.specs import spec
 from endless_gym_agents import checkpoint, protocol, tables
 from endless_gym_agents.agent import make_agent
@@ -55,8 +57,6 @@ def small(*paths: Path, **changes: object) -> EvalArguments:
         ("MortarMayhem-v0", {}, {"reward": 1.0, "commands_completed": 1.0, "success": 1}, 0, 1.0),
         (GRID, {"command_count": [1]}, {"reward": 0.0, "commands_completed": 1.0, "success": 1}, 0, 0.0),
         (GRID, {"command_count": [2, 4]}, {"reward": 0.3, "commands_completed": 1.0, "success": 1}, 0, 0.75),
-        # This reward does not show whether the last command failed.
-        (GRID, {"reward_episode_success": 1}, {"reward": 1.9, "commands_completed": 1.0, "success": 1}, 0, 1.0),
         ("MysteryPath-v0", {}, {"reward": 0.4, "success": 0}, 8, 0.5),
         ("MysteryPath-v0", {}, {"reward": 1.7, "success": 1}, 8, 1.0),
         ("MysteryPath-Grid-v0", {}, {"reward": 1.0, "success": 1}, 8, 1.0),
@@ -72,6 +72,40 @@ def test_task_progress_is_computed_from_infos_and_reward(
 ) -> None:
     progress = task_progress(spec(env), options, final, path)
     assert progress == (expected if expected is None else pytest.approx(expected))
+
+
+REWARDS = (
+    {},
+    {"reward_episode_success": 1.0},
+    {"reward_command_failure": -0.1},
+    {"reward_command_success": 0.0, "reward_episode_success": 1.0},
+    {"reward_command_failure": 0.05, "reward_episode_success": 0.7},
+)
+
+
+@pytest.mark.parametrize("rewards", REWARDS, ids=str)
+@pytest.mark.parametrize("counts", [[1], [2], [2, 4]], ids=str)
+def test_task_progress_of_mortar_mayhem_is_that_of_the_game(counts: list[int], rewards: dict[str, float]) -> None:
+    """An untrained agent has `success` whenever it fails at the last command; its task progress is what it executed."""
+    times = {"command_show_duration": [1], "command_show_delay": [0], "explosion_delay": [5], "explosion_duration": [1]}
+    options = {"command_count": counts, **times, **rewards}
+    env, draws, failed = Env(GRID, options=options, observation="features"), np.random.default_rng(35), 0
+    for seed in range(40):
+        env.reset(seed=seed)
+        done = False
+        while not done:
+            _, _, terminated, truncated, info = env.step(int(draws.integers(4)))
+            done = terminated or truncated
+        executed, commands = env.progress()["commands"]
+        assert task_progress(spec(GRID), options, info) == pytest.approx(executed / commands)
+        failed += info["success"] == 1 and executed < commands
+    assert failed > 0
+
+
+def test_a_failure_with_the_reward_of_a_success_counts_as_failed() -> None:
+    final = {"reward": 0.2, "commands_completed": 1.0, "success": 1}
+    options = {"command_count": [2], "reward_command_failure": 0.1}
+    assert task_progress(spec(GRID), options, final) == 0.5
 
 
 def test_path_lengths_match_the_published_episodes() -> None:
