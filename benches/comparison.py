@@ -27,6 +27,7 @@ import gymnasium
 import numpy as np
 
 import endless_gym
+from endless_gym import _native
 from endless_gym.__main__ import measure
 from endless_gym.program import program
 
@@ -72,7 +73,7 @@ class Original:
 
     def best(self, kind: str, id: str, seconds: float) -> int:
         """The number of environments with the highest steps per second."""
-        cores = os.cpu_count() or 1
+        cores = _native.cores()
         numbers = {1, cores, 2 * cores, 4 * cores, 16, 64}
         return max(sorted(numbers), key=lambda number: self.measure(kind, id, number, seconds))
 
@@ -141,7 +142,7 @@ def scale(args: argparse.Namespace) -> dict[str, float]:
 
 def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, Any]:
     """Measure all contenders for one environment id."""
-    cores = os.cpu_count() or 1
+    cores = _native.cores()
     best = {kind: original.best(kind, id, args.seconds / 2) for kind in VECTORS}
     contenders: dict[str, Any] = {}
     for kind in VECTORS:
@@ -218,7 +219,7 @@ def machine() -> dict[str, Any]:
     models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     return {
         "processor": models[0].split(":")[1].strip() if models else platform.machine(),
-        "cores": os.cpu_count(),
+        "cores": _native.cores(),
         "system": platform.platform(),
         "python": platform.python_version(),
         "endless_gym": endless_gym.__version__,

@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
 import platform
 import statistics
 from pathlib import Path
@@ -27,6 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from endless_gym import _native
 from endless_gym_agents import atomic, checkpoint, export, reproduce
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.conformance import state_bytes
@@ -295,7 +295,7 @@ def main() -> None:
             done.setdefault(task, []).append((found["score"], job))
     machine = {
         "machine": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
+        "cores": _native.cores(),
         "torch": torch.__version__,
     }
     lines = ",\n".join(json.dumps(rows[key]) for key in sorted(rows, key=str))

@@ -18,6 +18,7 @@ from typing import IO, Protocol
 
 import torch
 
+from endless_gym import _native
 from endless_gym_agents import atomic, checkpoint
 from endless_gym_agents.clock import duration
 from endless_gym_agents.command import on_stop_signals
@@ -58,7 +59,7 @@ class Machine:
     @property
     def engine_threads(self) -> int:
         """Threads per job that step the environments."""
-        return self.job_cores or max(1, cores() // self.jobs)
+        return self.job_cores or max(1, _native.cores() // self.jobs)
 
     def environment(self, slot: int) -> dict[str, str]:
         """Additional environment variables for the job in a slot."""
@@ -66,17 +67,12 @@ class Machine:
         return added | {"CUDA_VISIBLE_DEVICES": self.gpus[slot % len(self.gpus)]} if self.gpus else added
 
 
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
 def machine(jobs: int, device: str, nice: int = 19) -> Machine:
     """The local machine with a number of jobs at the same time; 0 for one per GPU, or without GPUs one per core."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     count = torch.cuda.device_count() if device in ("auto", "cuda") else 0
     gpus = tuple(given.split(",")[:count]) if given else tuple(map(str, range(count)))
-    return Machine(jobs or len(gpus) or cores(), gpus, device, nice)
+    return Machine(jobs or len(gpus) or _native.cores(), gpus, device, nice)
 
 
 def shown(command: Sequence[str], machine: Machine, slot: int = 0) -> str:

@@ -106,6 +106,7 @@ pub fn populate(module: &Bound<'_, PyModule>, registry: Result<Registry, Registr
     module.add_function(wrap_pyfunction!(buffers::note_export, module)?)?;
     module.add_function(wrap_pyfunction!(buffers::writable_view, module)?)?;
     module.add_function(wrap_pyfunction!(pool::check_pool_config, module)?)?;
+    module.add_function(wrap_pyfunction!(pool::cores, module)?)?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;
     module.add_function(wrap_pyfunction!(connection::segment_prefix, module)?)?;
     module.add_function(wrap_pyfunction!(ends::ended_episodes, module)?)?;

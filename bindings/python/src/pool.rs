@@ -57,6 +57,12 @@ pub struct Pools {
     process: u32,
 }
 
+/// Number of CPU cores that this process may use: those of its affinity, at most as many as its control group's quota allows.
+#[pyfunction]
+pub fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
 /// The groups, and what was sent to them.
 struct State {
     /// Empty after `close`.

@@ -1,6 +1,9 @@
 """Threads that use the same vector environment."""
 
 import asyncio
+import os
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +15,18 @@ import pytest
 from support import stop
 
 import endless_gym
+
+#: Starts two vector environments, prints `cores` and the number of threads that each started, and ends.
+COUNT = """
+import os, endless_gym
+from endless_gym import _native
+counts = [_native.cores()]
+for threads in (None, 3):
+    before = len(os.listdir("/proc/self/task"))
+    with endless_gym.make_vec("MortarMayhem-Grid-v0", 4, threads):
+        counts.append(len(os.listdir("/proc/self/task")) - before)
+print(*counts)
+"""
 
 ID = "MortarMayhem-Grid-v0"
 ACTIONS = np.array([0, 1, 2, 3])
@@ -120,3 +135,12 @@ def test_steps_of_asyncio_threads_take_turns(where: Any) -> None:
         for _ in range(20):
             twin.step(ACTIONS)
         np.testing.assert_array_equal(envs.step(ACTIONS)[0], twin.step(ACTIONS)[0])
+
+
+def test_the_default_number_of_threads_is_that_of_the_process_affinity() -> None:
+    """A pool of n threads starts n - 1; the calling thread is one of them."""
+    for count in {1, len(os.sched_getaffinity(0))}:
+        cores = sorted(os.sched_getaffinity(0))[:count]
+        command = ["taskset", "--cpu-list", ",".join(map(str, cores)), sys.executable, "-c", COUNT]
+        printed = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+        assert [int(number) for number in printed.split()] == [count, count - 1, 2]

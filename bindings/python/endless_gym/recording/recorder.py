@@ -133,7 +133,7 @@ def record(
         for number in range(count)
     ]
     frames, has_features = contents(described, observation, frames)
-    threads = integer("num_threads", num_threads or len(os.sched_getaffinity(0)), 1, _native.MAX_THREADS)
+    threads = integer("num_threads", num_threads or _native.cores(), 1, _native.MAX_THREADS)
     name = dataset or f"endless-gym/{described.id}/{_short(player)}-v0"
     start = time.perf_counter()
     total = 0.0
