@@ -118,9 +118,9 @@ fn dead_and_stopped_observers_hold_up_nobody() {
             seen
         });
         others[0].stop();
-        for number in 1..4 {
+        for other in &mut others[1..4] {
             (0..2).for_each(|group| play(&mut trainer, group, 100));
-            others[number].kill();
+            other.kill();
         }
         while !seen.is_finished() {
             step(&mut trainer, 0);
