@@ -1,7 +1,5 @@
 //! `endless bench`.
 
-mod scaling;
-
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -34,17 +32,17 @@ pub struct Args {
     id: String,
     /// Number of environments.
     #[arg(long, default_value_t = 1024)]
-    num_envs: usize,
+    pub num_envs: usize,
     /// Threads of the engine that serves the environments; 0 for one per core. Several numbers, such as `1,2,4,8`, print how speed
     /// grows with the threads instead, in process and through the service, and where the time of a step goes.
     #[arg(long, value_name = "N,..", value_delimiter = ',', default_value = "1")]
-    threads: Vec<usize>,
+    pub threads: Vec<usize>,
     /// Duration of one measurement in seconds.
     #[arg(long, default_value_t = 1.0)]
-    seconds: f64,
+    pub seconds: f64,
     /// Measurements of each method, at least 1.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..))]
-    rounds: u16,
+    pub rounds: u16,
     /// Also measure the original, with this Python interpreter, which must have `memory-gym` or `popgym` installed [default:
     /// the original is not measured].
     #[arg(long, value_name = "PYTHON")]
@@ -53,7 +51,22 @@ pub struct Args {
     environment: EnvironmentArgs,
     /// Print JSON [default: text].
     #[arg(long)]
-    json: bool,
+    pub json: bool,
+}
+
+impl Args {
+    /// Whether speeds with different numbers of threads are to be compared.
+    pub fn compares_threads(&self) -> bool {
+        self.threads.len() > 1
+    }
+
+    /// The environments to measure, and the flag that a signal sets.
+    pub fn check<'a>(&self, registry: &'a Registry) -> Result<(Vec<&'a EnvSpec>, &'static AtomicBool), Failure> {
+        options::seconds("--seconds", self.seconds)?;
+        let stop = stop::on_signal()?;
+        let one = self.id != "all";
+        Ok((if one { vec![registry.spec(&self.id)?] } else { registry.specs().collect() }, stop))
+    }
 }
 
 /// How environments are stepped.
@@ -94,24 +107,19 @@ struct Measurement {
 
 /// The result of one round.
 #[derive(Clone, Copy, Default)]
-struct Round {
-    steps_per_second: f64,
+pub struct Round {
+    pub steps_per_second: f64,
     batch_bytes: Option<usize>,
     huge_page_bytes: Option<u64>,
     /// Of an in-process measurement with several threads.
-    times: StepTimes,
+    pub times: StepTimes,
 }
 
 /// Runs `endless bench`.
 pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
-    options::seconds("--seconds", args.seconds)?;
-    let stop = stop::on_signal()?;
-    let specs: Vec<&EnvSpec> =
-        if args.id == "all" { registry.specs().collect() } else { vec![registry.spec(&args.id)?] };
+    let (specs, stop) = args.check(registry)?;
     let cores = Threads::new(0)?.count();
-    let [service_threads] = args.threads[..] else {
-        return scaling::run(registry, args, &specs, cores, stop);
-    };
+    let service_threads = args.threads[0];
     let mut methods = vec![Method::InProcess { threads: 1 }];
     if cores > 1 {
         methods.push(Method::InProcess { threads: cores });
@@ -256,7 +264,7 @@ fn time(
     Ok((batches * args.num_envs) as f64 / start.elapsed().as_secs_f64())
 }
 
-fn in_process(
+pub fn in_process(
     registry: &Registry,
     args: &Args,
     spec: &EnvSpec,
@@ -284,7 +292,7 @@ fn in_process(
     })
 }
 
-fn through_service(
+pub fn through_service(
     args: &Args,
     spec: &EnvSpec,
     reads: bool,

@@ -23,6 +23,7 @@ mod picture;
 mod play;
 mod play_command;
 mod record;
+mod scaling;
 mod serve;
 mod status;
 mod stop;
@@ -191,6 +192,7 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::View(args) => view::run(&args)?,
         Command::Play(args) => play_command::run(registry, &args)?,
         Command::Record(args) => record::run(registry, &args)?,
+        Command::Bench(args) if args.compares_threads() => scaling::run(registry, &args)?,
         Command::Bench(args) => bench::run(registry, &args)?,
         Command::Learn(settings) => learn::run(registry, &settings)?,
         Command::New(args) => new::run(registry, &args)?,

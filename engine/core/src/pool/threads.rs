@@ -2,6 +2,7 @@
 
 #[cfg(feature = "threads")]
 mod shares;
+mod step_times;
 #[cfg(feature = "threads")]
 mod times;
 #[cfg(feature = "threads")]
@@ -9,11 +10,11 @@ mod times;
 mod workers;
 
 use std::ops::Range;
-use std::time::Duration;
 
 use super::error::PoolError;
 #[cfg(feature = "threads")]
 use crate::batch::limits::MAX_THREADS;
+pub use step_times::StepTimes;
 
 /// Minimum number of environments per thread.
 const ENVS_FOR_THREAD: usize = 16;
@@ -24,24 +25,6 @@ const ENVS_FOR_THREADS: usize = 64;
 /// Maximum number of threads that step that many environments at the same time.
 pub(super) fn useful_threads(num_envs: usize) -> usize {
     if num_envs < ENVS_FOR_THREADS { 1 } else { num_envs / ENVS_FOR_THREAD }
-}
-
-/// Where the time of steps on several threads went. The sum of `opening`, `joining`, `working` and `waiting` is the time between
-/// the calls of the threads and their end; what a step takes beyond it is the calling thread's alone.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct StepTimes {
-    /// Steps.
-    pub steps: u64,
-    /// Until the calling thread began to step environments, after it had called and woken the workers.
-    pub opening: Duration,
-    /// From then until a thread joined, as the mean over the threads.
-    pub joining: Duration,
-    /// From then until the last thread joined.
-    pub last_join: Duration,
-    /// The time in which a thread stepped environments, as the mean over the threads.
-    pub working: Duration,
-    /// From the end of a thread's work until all were done, as the mean over the threads.
-    pub waiting: Duration,
 }
 
 /// Threads that step environments: the calling thread and workers. Several pools may share them; they then take turns.

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_utils::CachePadded;
 
-use super::StepTimes;
+use super::step_times::StepTimes;
 
 /// When a thread began and ended its work in a call, in nanoseconds since the call's start; the end is 0 if it has not.
 type Span = CachePadded<(AtomicU64, AtomicU64)>;

@@ -15,8 +15,8 @@ use std::time::Duration;
 use crossbeam_utils::CachePadded;
 use crossbeam_utils::sync::{Parker, Unparker};
 
-use super::StepTimes;
 use super::shares::Shares;
+use super::step_times::StepTimes;
 use super::times::Times;
 use crate::pool::sync::threads::{
     Arc, AtomicBool, AtomicPtr, AtomicU64, AtomicUsize, Ordering, PARK_AFTER, Wait, fence, thread,

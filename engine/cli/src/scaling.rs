@@ -1,15 +1,13 @@
 //! How speed grows with the threads, and where the time of a step goes.
 
-use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::pool::{Registry, Threads};
 use serde::Serialize;
 
-use super::{Args, Round, in_process, through_service};
-use crate::failure::Failure;
-use crate::output::{fit, grouped, print, print_json, progress, table};
+use super::bench::{Args, Round, in_process, through_service};
+use super::failure::Failure;
+use super::output::{fit, grouped, print, print_json, progress, table};
 
 /// The measurements of one environment.
 #[derive(Serialize)]
@@ -53,13 +51,8 @@ struct Parts {
 }
 
 /// Measures each environment with each number of threads, and with one.
-pub fn run(
-    registry: &Registry,
-    args: &Args,
-    specs: &[&EnvSpec],
-    cores: usize,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
+    let ((specs, stop), cores) = (args.check(registry)?, Threads::new(0)?.count());
     let mut counts: Vec<usize> = args.threads.iter().map(|count| if *count == 0 { cores } else { *count }).collect();
     counts.push(1);
     counts.sort_unstable();
@@ -67,7 +60,7 @@ pub fn run(
     let measurements = 2 * specs.len() * counts.len() * usize::from(args.rounds);
     let bar = progress(measurements as u64, "measuring {bar:40} {pos}/{len}  {msg}");
     let mut scalings = Vec::new();
-    for spec in specs {
+    for spec in &specs {
         let mut rounds = vec![(Vec::new(), Vec::new()); counts.len()];
         for _ in 0..args.rounds {
             for (count, (here, served)) in counts.iter().zip(&mut rounds) {
