@@ -20,6 +20,7 @@ mod play_page;
 mod pool;
 mod popgym;
 mod program;
+mod public_api;
 mod recordings;
 mod service;
 mod service_episodes;

@@ -7,7 +7,7 @@ use super::config::{BAR_HEIGHT, Config};
 use super::parameters::{MAX_SPOTLIGHTS, Parameters};
 use super::position_sampler::PositionSampler;
 use super::spotlight::Spotlight;
-use super::state::{Background, Exit, State};
+use super::state::{Background, Exit, SPAWN_MARGIN, State};
 use crate::character::{Bounds, Character};
 use crate::screen::SCREEN;
 use crate::vector::distance;
@@ -15,9 +15,6 @@ use endless_gym_core::envs::Transition;
 use endless_gym_core::random::Generator;
 
 const WALKABLE: Bounds = (0, BAR_HEIGHT as i32, SCREEN as i32, SCREEN as i32);
-
-/// Minimum distance in pixels between the centres of coins and exit and the screen's border.
-pub(super) const SPAWN_MARGIN: i32 = 7;
 
 /// Minimum distances in pixels from the agent, from coins and exit, and between two coins of the endless id.
 const AGENT_SPACE: i32 = 28;

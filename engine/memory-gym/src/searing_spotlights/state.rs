@@ -5,11 +5,13 @@ use serde::{Deserialize, Serialize};
 use super::circles::Circle;
 use super::config::{BAR_HEIGHT, Config};
 use super::parameters::{MAX_AGENT_SCALE, MAX_SPOTLIGHTS, Parameters};
-use super::rules::SPAWN_MARGIN;
 use super::spotlight::Spotlight;
 use crate::character::{Character, CharacterSize};
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Progress;
+
+/// Minimum distance in pixels between the centres of coins and exit and the screen's border.
+pub(super) const SPAWN_MARGIN: i32 = 7;
 
 /// The background of the screen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
