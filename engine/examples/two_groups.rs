@@ -5,7 +5,6 @@
 //! ```
 
 use std::error::Error;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym::memory_gym;
@@ -23,17 +22,12 @@ const INFERENCE_TIME: Duration = Duration::from_micros(100);
 fn main() -> Result<(), Box<dyn Error>> {
     // Usually a process of its own: `endless serve --groups 2 --service two-groups ...`.
     let config = EngineConfig::new(SERVICE, PoolConfig::new(ID, NUM_ENVS), 1);
-    let mut engine = Engine::new(memory_gym(), &config.groups(2))?;
-    let stop = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        let running = scope.spawn(|| engine.run(&stop));
-        let played = play();
-        stop.store(true, Ordering::Relaxed);
-        let summary = running.join().map_err(|_| "the engine panicked")??;
-        let rate = (2 * STEPS * NUM_ENVS) as f64 / played?.as_secs_f64();
-        println!("{rate:.0} steps per second with two groups; the engine sent {} batches", summary.batches);
-        Ok(())
-    })
+    let engine = Engine::new(memory_gym(), &config.groups(2))?.spawn()?;
+    let rate = (2 * STEPS * NUM_ENVS) as f64 / play()?.as_secs_f64();
+    engine.stop();
+    let summary = engine.join()?;
+    println!("{rate:.0} steps per second with two groups; the engine sent {} batches", summary.batches);
+    Ok(())
 }
 
 /// Plays both groups and returns how long it took.

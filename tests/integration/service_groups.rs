@@ -4,13 +4,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
-use endless_gym::service::{BatchLease, CheckpointConfig, Engine, EngineConfig, ServiceError, Trainer, TrainerGroup};
+use endless_gym::service::{
+    BatchLease, CheckpointConfig, Engine, EngineConfig, Rejection, ServiceError, Trainer, TrainerGroup,
+};
 
 use crate::support::meeting::PANIC;
 use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::{Process, TIMEOUT};
-use crate::support::service::{ID, assert_error};
+use crate::support::service::{ID, assert_error, assert_rejected};
 
 const NUM_ENVS: usize = 8;
 const GROUPS: usize = 8;
@@ -137,7 +139,7 @@ fn a_panic_of_an_environment_ends_the_engine() {
         let place = Place::new();
         let (mut engine, mut trainer) = place.meeting(NUM_ENVS, GROUPS, threads);
         send(&mut trainer.groups()[5], PANIC);
-        assert_error!(trainer.receive(5, TIMEOUT), ServiceError::EngineLost { .. });
+        assert_rejected(trainer.receive(5, TIMEOUT), Rejection::Panic, "as the trainer wants");
         assert!(!engine.wait().success());
     }
 }

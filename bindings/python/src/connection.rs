@@ -9,7 +9,8 @@ use std::time::{Duration, Instant};
 use endless_gym::batch::Block;
 use endless_gym::pool::{NextOptions, OptionMap};
 use endless_gym::service::{
-    self, BatchLease, ConnectConfig, GroupReconnection, LastRequest, Namespace, ServiceError, Trainer, TrainerGroup,
+    self, BatchLease, ConnectConfig, ErrorKind, GroupReconnection, LastRequest, Namespace, ServiceError, Trainer,
+    TrainerGroup,
 };
 use pyo3::exceptions::{PyIndexError, PyRuntimeError};
 use pyo3::prelude::*;
@@ -380,12 +381,9 @@ pub fn wait_for_engine<T: Send>(
         match py.detach(|| connect(left.min(SIGNAL_INTERVAL))) {
             Ok(connected) => return Ok(connected),
             // The engine is not running yet, or it was replaced during the call, or another process has locked the namespace.
-            Err(
-                ServiceError::UnknownEngine { .. }
-                | ServiceError::EngineUnreachable { .. }
-                | ServiceError::EngineRestarted { .. }
-                | ServiceError::NamespaceLocked { .. },
-            ) if left > SIGNAL_INTERVAL => {
+            Err(error)
+                if left > SIGNAL_INTERVAL && matches!(error.kind(), ErrorKind::Unavailable | ErrorKind::Lost) =>
+            {
                 py.check_signals()?;
             }
             Err(error) => return Err(errors::service(error)),

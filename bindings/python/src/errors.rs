@@ -1,7 +1,7 @@
 //! Errors of the engine as Python exceptions.
 
 use endless_gym::pool::{PoolError, SnapshotError};
-use endless_gym::service::{Rejection, ServiceError};
+use endless_gym::service::{ErrorKind, Rejection, ServiceError};
 use pyo3::exceptions::{PyConnectionError, PyOSError, PyRuntimeError, PyTimeoutError, PyValueError};
 use pyo3::import_exception;
 use pyo3::prelude::*;
@@ -53,33 +53,18 @@ pub fn service(error: ServiceError) -> PyErr {
         }
         error => error.to_string(),
     };
-    match error {
-        E::Pool(error) => pool(error),
-        E::EngineLost { .. } | E::EngineRestarted { .. } | E::SpecificationChanged { .. } | E::RootRemoved { .. } => {
-            EngineLost::new_err(text)
-        }
-        E::TooManyBatchesHeld { .. } => TooManyBatchesHeld::new_err(text),
-        E::UnknownEngine { .. }
-        | E::EngineUnreachable { .. }
-        | E::TrainerExists { .. }
-        | E::TooManyObservers { .. } => PyConnectionError::new_err(text),
-        E::Rejected { reason: Rejection::NotReset | Rejection::Checkpoint | Rejection::Panic, .. } => {
+    match (error.kind(), error) {
+        (_, E::Pool(error)) => pool(error),
+        (_, E::TooManyBatchesHeld { .. }) => TooManyBatchesHeld::new_err(text),
+        (_, E::NamespaceLocked { .. }) | (ErrorKind::TimedOut, _) => PyTimeoutError::new_err(text),
+        (_, E::EngineExists { .. } | E::SharedMemoryTooSmall { .. }) => PyRuntimeError::new_err(text),
+        (_, E::Rejected { reason: Rejection::NotReset | Rejection::Checkpoint | Rejection::Panic, .. }) => {
             PyRuntimeError::new_err(text)
         }
-        E::TimedOut { .. } | E::NamespaceLocked { .. } => PyTimeoutError::new_err(text),
-        E::InvalidName { .. }
-        | E::InvalidTimeout { .. }
-        | E::NoSuchGroup { .. }
-        | E::Action(_)
-        | E::ResetCount { .. }
-        | E::OptionsTooLong { .. }
-        | E::SnapshotTooLong { .. }
-        | E::Rejected { .. } => PyValueError::new_err(text),
-        E::Root { .. }
-        | E::ForeignSegment { .. }
-        | E::DescriptorLimit { .. }
-        | E::ResourceLimit { .. }
-        | E::MemoryLimit { .. } => PyOSError::new_err(text),
+        (ErrorKind::Lost, _) => EngineLost::new_err(text),
+        (ErrorKind::Unavailable | ErrorKind::InUse, _) => PyConnectionError::new_err(text),
+        (ErrorKind::Invalid | ErrorKind::Rejected, _) => PyValueError::new_err(text),
+        (ErrorKind::Resources, _) => PyOSError::new_err(text),
         _ => PyRuntimeError::new_err(text),
     }
 }

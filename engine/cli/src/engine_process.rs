@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{ConnectConfig, EngineConfig, Namespace, ROOT_VARIABLE, ServiceError, Trainer};
+use endless_gym_service::{ConnectConfig, EngineConfig, ErrorKind, Namespace, ROOT_VARIABLE, Trainer};
 
 use super::failure::Failure;
 
@@ -109,11 +109,7 @@ impl EngineProcess {
         let start = Instant::now();
         loop {
             match Trainer::connect(&self.config) {
-                Err(
-                    ServiceError::UnknownEngine { .. }
-                    | ServiceError::EngineUnreachable { .. }
-                    | ServiceError::NamespaceLocked { .. },
-                ) => {}
+                Err(error) if error.kind() == ErrorKind::Unavailable => {}
                 connected => return Ok(connected?),
             }
             if let Some(status) = self.child.try_wait()? {

@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{ConnectConfig, Namespace, Observed, Observers, ServiceError, running_engines};
+use endless_gym_service::{ConnectConfig, ErrorKind, Namespace, Observed, Observers, ServiceError, running_engines};
 use endless_gym_view::RecentEpisodes;
 use serde_json::json;
 
@@ -149,12 +149,7 @@ pub fn connect(
         let left = timeout.saturating_sub(start.elapsed());
         let config = ConnectConfig::new(service).timeout(left.min(SLICE));
         match Observers::connect(&config, group) {
-            Err(
-                ServiceError::UnknownEngine { .. }
-                | ServiceError::EngineUnreachable { .. }
-                | ServiceError::EngineRestarted { .. }
-                | ServiceError::NamespaceLocked { .. },
-            ) if left > SLICE => {}
+            Err(error) if left > SLICE && matches!(error.kind(), ErrorKind::Unavailable | ErrorKind::Lost) => {}
             connected => return Ok(Some(connected?)),
         }
         if stop.load(Ordering::Relaxed) {

@@ -1,7 +1,8 @@
 //! Errors of engines, trainers and observers.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::io;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use endless_gym_core::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
@@ -17,6 +18,7 @@ pub(crate) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Why an engine, trainer or observer could not be created, or a call on one failed.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum ServiceError {
     /// An engine name is malformed.
     #[error("engine name must be 1 to {max_length} letters, digits, `.`, `_` or `-`, got `{given}`")]
@@ -334,6 +336,16 @@ pub enum ServiceError {
         /// iceoryx2's error.
         reason: String,
     },
+    /// The operating system refuses an operation on a file of the namespace.
+    #[error("{action}: {}: {source}", path.display())]
+    File {
+        /// What failed.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The operating system's error.
+        source: io::Error,
+    },
     /// An unexpected error of iceoryx2.
     #[error("{action}: {reason}")]
     Middleware {
@@ -344,7 +356,76 @@ pub enum ServiceError {
     },
 }
 
+/// What a caller can do about a [`ServiceError`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ErrorKind {
+    /// Correct the argument: it is out of range or malformed.
+    Invalid,
+    /// Make another call first, or drop a lease: the call does not fit what was called before.
+    OutOfOrder,
+    /// Try again: the engine is not running yet, or another process is busy in its namespace.
+    Unavailable,
+    /// Another process has the name or the place; end it, or choose another.
+    InUse,
+    /// Reconnect: the engine that this process was connected to has ended or cannot be found any more.
+    Lost,
+    /// Call again: the engine is running and has not answered in time.
+    TimedOut,
+    /// Install the same version for all processes.
+    Incompatible,
+    /// Raise a limit, or choose another directory: memory, descriptors or files are not available.
+    Resources,
+    /// The engine rejected the request and says why.
+    Rejected,
+    /// The environments or their checkpoint failed.
+    Environments,
+    /// Nothing is known that would help.
+    Other,
+}
+
 impl ServiceError {
+    /// What the caller can do.
+    pub fn kind(&self) -> ErrorKind {
+        use ServiceError as E;
+        match self {
+            E::InvalidName { .. }
+            | E::OutOfRange { .. }
+            | E::InvalidTimeout { .. }
+            | E::NoSuchGroup { .. }
+            | E::Action(_)
+            | E::ResetCount { .. }
+            | E::OptionsTooLong { .. }
+            | E::SnapshotTooLong { .. } => ErrorKind::Invalid,
+            E::AnswerPending { .. } | E::NothingSent { .. } | E::NothingPending | E::TooManyBatchesHeld { .. } => {
+                ErrorKind::OutOfOrder
+            }
+            E::UnknownEngine { .. } | E::EngineUnreachable { .. } | E::NamespaceLocked { .. } => ErrorKind::Unavailable,
+            E::EngineExists { .. } | E::TrainerExists { .. } | E::TooManyObservers { .. } => ErrorKind::InUse,
+            E::EngineLost { .. }
+            | E::EngineRestarted { .. }
+            | E::SpecificationChanged { .. }
+            | E::RootRemoved { .. } => ErrorKind::Lost,
+            E::TimedOut { .. } => ErrorKind::TimedOut,
+            E::Version { .. } | E::IncompatibleTypes { .. } | E::Specification { .. } => ErrorKind::Incompatible,
+            E::Root { .. }
+            | E::ForeignSegment { .. }
+            | E::SharedMemoryTooSmall { .. }
+            | E::MemoryLimit { .. }
+            | E::DescriptorLimit { .. }
+            | E::ResourceLimit { .. }
+            | E::File { .. } => ErrorKind::Resources,
+            E::Rejected { .. } => ErrorKind::Rejected,
+            E::Pool(_) | E::Checkpoint(_) | E::Panic { .. } => ErrorKind::Environments,
+            E::Middleware { .. } => ErrorKind::Other,
+        }
+    }
+
+    /// Wraps an error of an operation on a file.
+    pub(crate) fn file(action: &'static str, path: &Path) -> impl Fn(io::Error) -> Self {
+        move |source| ServiceError::File { action, path: path.to_owned(), source }
+    }
+
     /// Wraps an iceoryx2 error that has no variant of its own.
     pub(crate) fn middleware<E: fmt::Display>(action: &'static str) -> impl Fn(E) -> Self {
         move |error| {
@@ -365,6 +446,7 @@ impl ServiceError {
 
 /// Why an engine rejected a request. Except for [`Rejection::Panic`], no environment has changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Rejection {
     /// The request has another layout version.
     Version,
@@ -425,6 +507,7 @@ fn megabytes(bytes: u64) -> u64 {
 
 /// What an engine was doing when an answer or an observed batch did not arrive in time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum EngineActivity {
     /// Its process is running; its status cannot be read.
     Unknown,
@@ -489,6 +572,7 @@ pub const CHECKPOINT_VERSION: u32 = 1;
 
 /// A checkpoint that cannot be saved or used.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum CheckpointError {
     /// The interval is zero.
     #[error("the interval between checkpoints must be positive")]

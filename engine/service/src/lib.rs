@@ -129,6 +129,7 @@ mod engine {
     pub(crate) mod checkpoint;
     pub(crate) mod config;
     pub(crate) mod group;
+    pub(crate) mod handle;
     pub(crate) mod pictures;
     pub(crate) mod serving;
     pub(crate) mod status_writer;
@@ -156,9 +157,10 @@ pub use client::status::{EngineMonitor, EngineProcesses, EngineStatus, GroupStat
 pub use client::trainer::Trainer;
 pub use client::trainer_group::TrainerGroup;
 pub use engine::config::{CheckpointConfig, EngineConfig};
+pub use engine::handle::EngineHandle;
 pub use engine::serving::Engine;
 pub use engine::status_writer::EngineSummary;
-pub use error::{CHECKPOINT_VERSION, CheckpointError, EngineActivity, Rejection, ServiceError};
+pub use error::{CHECKPOINT_VERSION, CheckpointError, EngineActivity, ErrorKind, Rejection, ServiceError};
 pub use namespace::directory::{Namespace, ROOT_VARIABLE};
 pub use namespace::process::LockHolder;
 pub use protocol::discovery::running_engines;

@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{ConnectConfig, EngineStatus, Observer, Pictures, ServiceError, ServiceSpecification};
+use endless_gym_service::{
+    ConnectConfig, EngineStatus, ErrorKind, Observer, Pictures, ServiceError, ServiceSpecification,
+};
 use serde_json::{Value as Json, json};
 
 use crate::channel::{Channel, Viewer};
@@ -70,12 +72,10 @@ struct State {
 impl State {
     fn failed(&mut self, error: &ServiceError) {
         self.reason = error.to_string();
-        self.name = match error {
-            ServiceError::EngineLost { .. }
-            | ServiceError::RootRemoved { .. }
-            | ServiceError::EngineRestarted { .. } => "lost",
+        self.name = match error.kind() {
+            ErrorKind::Lost => "lost",
             // Keeps `lost` for an engine that was running before.
-            ServiceError::UnknownEngine { .. } | ServiceError::EngineUnreachable { .. } => self.name,
+            ErrorKind::Unavailable => self.name,
             _ => "refused",
         };
     }

@@ -291,6 +291,7 @@ impl<S: SectionTable> TryFrom<LayoutFields> for Layout<S> {
 
 /// A layout's description is invalid.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum LayoutError {
     /// There are no environments, or too many.
     #[error("num_envs must be 1 to {MAX_ENVS}, got {given}")]

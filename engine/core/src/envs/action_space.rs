@@ -195,6 +195,7 @@ pub struct InvalidActionSpace {
 
 /// There are too few or too many actions, or one is out of range.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum ActionError {
     /// Too few or too many numbers.
     #[error(

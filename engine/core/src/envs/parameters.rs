@@ -231,6 +231,7 @@ impl ResetParameters {
 
 /// An invalid reset parameter.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum ParameterError {
     /// The environment has no reset parameter with this name.
     #[error("{id} has no reset parameter `{name}`; it has {allowed}")]

@@ -14,6 +14,7 @@ use crate::random::EntropyError;
 ///
 /// Except for [`PoolError::WrongFrame`] and [`PoolError::Panic`], an error changes no environment and no batch.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum PoolError {
     /// The registry has no environment with this id.
     #[error(transparent)]

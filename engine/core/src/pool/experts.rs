@@ -89,6 +89,7 @@ impl Experts {
 
 /// Experts cannot be created, or cannot play a batch.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum ExpertsError {
     /// The registry does not have the id.
     #[error(transparent)]

@@ -143,6 +143,7 @@ impl<E: Environment + 'static> AnyFamily for Family<E> {
 
 /// The registry refuses an environment.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum RegistryError {
     /// Two environments have the same id.
     #[error("the registry already has an environment `{id}`")]

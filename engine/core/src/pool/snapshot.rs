@@ -73,6 +73,7 @@ impl<S: DeserializeOwned> Saved<S> {
 
 /// A snapshot cannot be taken or restored. Except for [`SnapshotError::Panic`], the environment has not changed.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum SnapshotError {
     /// The pool has no environment with this number.
     #[error("env must be 0 to {}, got {given}", num_envs - 1)]
@@ -140,6 +141,7 @@ pub struct SavedEnv {
 
 /// A pool cannot continue from a saved state.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum ResumeError {
     /// The number of environments differs.
     #[error("the saved state must have {num_envs} environments, got {given}")]

@@ -179,6 +179,7 @@ impl Trace {
 
 /// A trace cannot be read or replayed.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum TraceError {
     /// The file cannot be opened.
     #[error("the trace cannot be opened: {0}")]

@@ -392,16 +392,15 @@ pub(crate) fn reserve_for_observer(
         CallbackProgression::Stop
     });
     let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
-    let segment = publisher.and_then(|publisher| data_segment(publisher, services.node.config()));
-    let segment =
-        segment.and_then(|path| File::options().read(true).write(true).open(path).ok()).ok_or_else(restarted)?;
+    let path = publisher.and_then(|publisher| data_segment(publisher, services.node.config())).ok_or_else(restarted)?;
+    let segment = File::options().read(true).write(true).open(&path).map_err(|_| restarted())?;
 
     let unused = limits.observer_chunks() * (specification.observers - observers);
     let chunk = (chunk_blocks(&specification.batch) * BLOCK_BYTES) as u64;
-    let failed = |e: std::io::Error| ServiceError::middleware("cannot reserve shared memory")(e);
-    let bytes = segment.metadata().map_err(failed)?.len().saturating_sub(chunk * unused as u64).max(1);
+    let failed = ServiceError::file("cannot reserve shared memory", &path);
+    let bytes = segment.metadata().map_err(&failed)?.len().saturating_sub(chunk * unused as u64).max(1);
     // `blocks` counts what is already allocated, in units of 512 bytes. The observer's port needs memory, too.
-    let allocated = segment.metadata().map_err(failed)?.blocks().saturating_mul(512);
+    let allocated = segment.metadata().map_err(&failed)?.blocks().saturating_mul(512);
     memory::check_free(bytes.saturating_sub(allocated).saturating_add(memory::MARGIN))?;
     match rustix::fs::fallocate(&segment, FallocateFlags::KEEP_SIZE, 0, bytes) {
         Ok(()) => Ok(()),

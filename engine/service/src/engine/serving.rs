@@ -50,7 +50,6 @@ const START_ATTEMPTS: usize = 3;
 /// Serves groups of environments to a trainer and to observers in other processes.
 ///
 /// ```
-/// use std::sync::atomic::{AtomicBool, Ordering};
 /// use std::time::Duration;
 ///
 /// use endless_gym_memory_gym::memory_gym;
@@ -64,26 +63,22 @@ const START_ATTEMPTS: usize = 3;
 /// # */
 /// let pool = PoolConfig::new("MortarMayhem-Grid-v0", 4);
 /// let config = EngineConfig::new("example", pool, 1).namespace(namespace.clone());
-/// let mut engine = Engine::new(memory_gym(), &config)?;
-/// let stop = AtomicBool::new(false);
+/// let engine = Engine::new(memory_gym(), &config)?.spawn()?;
 ///
-/// std::thread::scope(|scope| {
-///     let running = scope.spawn(|| engine.run(&stop));
-///     // Usually in another process:
-///     let timeout = Duration::from_secs(10);
-///     let mut trainer = Trainer::connect(&ConnectConfig::new("example").namespace(namespace).timeout(timeout))?;
-///     trainer.reset(0, ResetRequest::Seed(1))?;
-///     let first = trainer.receive(0, timeout)?;
-///     assert_eq!(first.batch().observation().len(), 4 * 84 * 84 * 3);
-///     trainer.send_with(0, |actions| actions.fill(0))?;
-///     let second = trainer.receive(0, timeout)?;
-///     assert_eq!(second.batch().episode_length(), [1; 4]);
-///     stop.store(true, Ordering::Relaxed);
-///     let summary = running.join().expect("the engine does not panic")?;
-///     assert_eq!((summary.batches, summary.env_steps), (2, 4));
-///     Ok::<(), endless_gym_service::ServiceError>(())
-/// })?;
-/// # drop(engine);
+/// // Usually in another process:
+/// let timeout = Duration::from_secs(10);
+/// let mut trainer = Trainer::connect(&ConnectConfig::new("example").namespace(namespace).timeout(timeout))?;
+/// trainer.reset(0, ResetRequest::Seed(1))?;
+/// let first = trainer.receive(0, timeout)?;
+/// assert_eq!(first.batch().observation().len(), 4 * 84 * 84 * 3);
+/// trainer.send_with(0, |actions| actions.fill(0))?;
+/// let second = trainer.receive(0, timeout)?;
+/// assert_eq!(second.batch().episode_length(), [1; 4]);
+///
+/// engine.stop();
+/// let summary = engine.join()?;
+/// assert_eq!((summary.batches, summary.env_steps), (2, 4));
+/// # drop((first, second, trainer));
 /// # std::fs::remove_dir_all(root).ok();
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
@@ -282,7 +277,8 @@ impl Engine {
         (0..self.groups.len()).map(|group| self.status.step(group)).collect()
     }
 
-    /// Serves requests until `stop` is set. Returns within 0.2 s after that, or when the last checkpoint is saved.
+    /// Serves requests in this thread until `stop` is set, for programs whose signal handlers set a flag; see also
+    /// [`spawn`](Engine::spawn). Returns within 0.2 s after that, or when the last checkpoint is saved.
     ///
     /// # Errors
     ///

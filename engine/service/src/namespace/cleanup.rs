@@ -59,8 +59,7 @@ pub(crate) fn remove_counter(config: &Config, _lock: &NamespaceLock) -> Result<(
     for path in files::segments(config).filter(|path| files::is_node_counter(path)) {
         match fs::remove_file(&path) {
             Err(e) if e.kind() != ErrorKind::NotFound => {
-                let failed = ServiceError::middleware("cannot remove the counter of nodes");
-                return Err(failed(format!("{}: {e}", path.display())));
+                return Err(ServiceError::file("cannot remove the counter of nodes", &path)(e));
             }
             _ => {}
         }

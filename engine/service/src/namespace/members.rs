@@ -26,15 +26,13 @@ impl Membership {
     /// segment.
     pub(crate) fn join(prefix: &str, _lock: &NamespaceLock) -> Result<Self, ServiceError> {
         let path = file_of(prefix);
-        let failed = |e: std::io::Error| {
-            ServiceError::middleware("cannot register this process")(format!("{}: {e}", path.display()))
-        };
+        let failed = ServiceError::file("cannot register this process", &path);
         loop {
-            let mut file = open(&path, true).map_err(failed)?;
-            file.lock_shared().map_err(failed)?;
-            if file.metadata().map_err(failed)?.len() == 0 {
+            let mut file = open(&path, true).map_err(&failed)?;
+            file.lock_shared().map_err(&failed)?;
+            if file.metadata().map_err(&failed)?.len() == 0 {
                 // An empty file would be removed as an unsized segment.
-                file.write_all(b"\n").map_err(failed)?;
+                file.write_all(b"\n").map_err(&failed)?;
             }
             // If they differ, another process has removed the file in the meantime.
             if is_same(&file, &path) {

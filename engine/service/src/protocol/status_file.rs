@@ -126,22 +126,16 @@ impl StatusFile {
 
     /// Gives the file its name; by then it is complete and locked.
     pub(crate) fn publish(&mut self, path: &Path) -> Result<(), ServiceError> {
-        fs::rename(&self.path, path)
-            .map_err(|e| ServiceError::middleware("cannot publish the status")(format!("{}: {e}", path.display())))?;
+        fs::rename(&self.path, path).map_err(ServiceError::file("cannot publish the status", path))?;
         path.clone_into(&mut self.path);
         Ok(())
     }
 
     fn with_record(path: &Path, words: usize, record: &impl Pod, text: &[u8]) -> Result<Self, ServiceError> {
-        let failed = |e: &dyn std::fmt::Display| ServiceError::middleware("cannot create the status")(e);
         let unnamed = path.with_extension("new");
-        let file = File::options()
-            .read(true)
-            .write(true)
-            .create_new(true)
-            .mode(0o400)
-            .open(&unnamed)
-            .map_err(|e| failed(&format_args!("{}: {e}", unnamed.display())))?;
+        let failed = ServiceError::file("cannot create the status", &unnamed);
+        let file =
+            File::options().read(true).write(true).create_new(true).mode(0o400).open(&unnamed).map_err(&failed)?;
         let prepared = flock(&file, FlockOperation::NonBlockingLockExclusive)
             // Without allocation, writing to the mapping raises SIGBUS when there is no memory.
             .and_then(|()| fallocate(&file, FallocateFlags::empty(), 0, (words * WORD + text.len()) as u64))
@@ -154,12 +148,12 @@ impl StatusFile {
             });
         let start = prepared.map_err(|e| {
             let _ = fs::remove_file(&unnamed);
-            failed(&e)
+            failed(e.into())
         })?;
-        let start = NonNull::new(start.cast()).ok_or_else(|| failed(&"the mapping has no address"))?;
-        let status = StatusFile { start, words, path: unnamed, process: std::process::id(), file };
+        let start = NonNull::new(start.cast()).ok_or_else(|| failed(Errno::NOMEM.into()))?;
+        let status = StatusFile { start, words, path: unnamed.clone(), process: std::process::id(), file };
         status.write(0, record);
-        status.file.write_all_at(text, (words * WORD) as u64).map_err(|e| failed(&e))?;
+        status.file.write_all_at(text, (words * WORD) as u64).map_err(&failed)?;
         Ok(status)
     }
 
