@@ -67,7 +67,9 @@ struct Versioned {
 #[inline]
 pub fn read(content: &[u8]) -> Result<File<'_>, FileError> {
     match content.first_chunk().map(|length| u64::from_le_bytes(*length)) {
-        Some(given) if given > MAX_DESCRIPTION => return Err(FileError::Tensors { given }),
+        Some(given) if given > MAX_DESCRIPTION && given <= content.len() as u64 => {
+            return Err(FileError::Tensors { given });
+        }
         _ => {}
     }
     let tensors = SafeTensors::deserialize(content)?;
