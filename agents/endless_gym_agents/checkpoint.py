@@ -130,7 +130,7 @@ def last(run: str | Path) -> Path:
 
 
 def protected(path: str | Path) -> list[Path]:
-    """The files that a program that reads this checkpoint must not overwrite: the checkpoint, and the other files of its run.
+    """The files that a program that reads this checkpoint must not overwrite: it, and the settings, log and checkpoints.
 
     Args:
         path: As for `load`.

@@ -54,12 +54,13 @@ class Logger:
         self._updates = settings.ppo.updates
         self._recent: deque[float] = deque(maxlen=20)
         self._has_warned = False
-        self._progress = (run / PROGRESS).open("ab")
+        # Before it is opened for appending, which would wait if it were a FIFO.
         ends = [0, *(end for _, end in itertools.islice(_rows(run), update))]
         if len(ends) <= update:
             raise MissingRow(
                 f"{run / PROGRESS} has no row of update {len(ends)}, and the checkpoint is of update {update}; {_help(run)}"
             )
+        self._progress = (run / PROGRESS).open("ab")
         self._progress.truncate(ends[update])
         # The axis is environment steps, in which runs of different settings can be compared.
         self._board: Any = SummaryWriter(str(run), purge_step=steps + 1)  # type: ignore[no-untyped-call]

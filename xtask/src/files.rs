@@ -50,7 +50,8 @@ pub fn check() -> Result<(), String> {
 /// Checks the subjects of the commits since CONTRIBUTING.md defines them, as far as the clone has them.
 fn subjects() -> Result<(), String> {
     let log = ["log", "--no-merges", "--since", "2026-11-27T12:00:00Z", "--format=%s"];
-    let subjects = output(Command::new("git").current_dir(workspace()).args(log))?;
+    // A source archive has no commits.
+    let Ok(subjects) = output(Command::new("git").current_dir(workspace()).args(log)) else { return Ok(()) };
     let is_right = |subject: &str| subject.contains(": ") && subject.chars().count() <= 72;
     match subjects.lines().find(|subject| !is_right(subject)) {
         None => Ok(()),

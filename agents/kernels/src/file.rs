@@ -93,9 +93,11 @@ pub fn read(content: &[u8]) -> Result<File<'_>, FileError> {
 
 /// Makes a file with a header, which has the entry `"version"` with [`VERSION`].
 ///
+/// The tensors must have different names.
+///
 /// # Errors
 ///
-/// If two tensors have the same name.
+/// [`SafeTensorError`] if a view's data do not fit its shape.
 pub fn write(header: String, tensors: Vec<(String, TensorView<'_>)>) -> Result<Vec<u8>, SafeTensorError> {
     let sum = checksum(VERSION, &header, &tensors);
     let metadata = [(HEADER.to_owned(), header), (CHECKSUM.to_owned(), sum)];

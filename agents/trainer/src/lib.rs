@@ -119,7 +119,8 @@ pub fn learn(
         state = match player.collect(&network, &threads, update, &mut clock).and_then(|()| player.state()) {
             Ok(state) => state,
             Err(error) => {
-                logger.sync()?;
+                // Saving comes first, and the engine's error says more than those of the log.
+                let _ = logger.sync();
                 save((update, steps), &network, &learner, &state, false)?;
                 return Err(Error::Saved { error: Box::new(error), update, run: run.to_owned() });
             }

@@ -87,12 +87,15 @@ def torch_view(array: NDArray[Any]) -> torch.Tensor:
 
 def mapping_of(address: int, size: int = 1) -> tuple[int, int]:
     """First address and size in bytes of the memory mappings of this process that contain `size` bytes at `address`."""
-    start = None
+    start, last = None, 0
     with open("/proc/self/maps") as maps:
         for line in maps:
             first, end = (int(number, 16) for number in line.split(maxsplit=1)[0].split("-"))
             if first <= address < end:
                 start = first
+            elif start is not None and first != last:
+                break
+            last = end
             # The kernel may divide the heap into adjacent mappings.
             if start is not None and end >= address + size:
                 return start, end - start

@@ -61,7 +61,7 @@ pub fn service(error: ServiceError) -> PyErr {
         (_, E::Rejected { reason: Rejection::NotReset | Rejection::Checkpoint | Rejection::Panic, .. }) => {
             PyRuntimeError::new_err(text)
         }
-        (ErrorKind::Lost, _) => EngineLost::new_err(text),
+        (ErrorKind::Lost, _) | (_, E::SpecificationChanged { .. }) => EngineLost::new_err(text),
         (ErrorKind::Unavailable | ErrorKind::InUse, _) => PyConnectionError::new_err(text),
         (ErrorKind::Invalid | ErrorKind::Rejected, _) => PyValueError::new_err(text),
         (ErrorKind::Resources, _) => PyOSError::new_err(text),

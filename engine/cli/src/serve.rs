@@ -134,8 +134,8 @@ fn read(path: &Path) -> Result<EngineConfig, Failure> {
 fn watch(engine: &Engine, config: &EngineConfig, stop: &'static AtomicBool) -> Result<Option<Watchdog>, Failure> {
     let Some(monitor) = EngineMonitor::open(&config.namespace, engine.specification()) else { return Ok(None) };
     let (service, id, namespace) = (config.service.clone(), config.pool.id.clone(), config.namespace.clone());
-    let stuck = move |grace| match monitor.activity() {
-        activity @ EngineActivity::Busy { kind, since, .. } if since >= grace && kind != "checkpoint" => {
+    let stuck = move |grace| match monitor.longest()? {
+        activity @ EngineActivity::Busy { since, .. } if since >= grace => {
             Some(format!("engine `{service}` of {id} was asked to stop, but {activity}; it ends without saving"))
         }
         _ => None,

@@ -372,7 +372,8 @@ pub enum ErrorKind {
     Lost,
     /// Call again: the engine is running and has not answered in time.
     TimedOut,
-    /// Install the same version for all processes.
+    /// The engine has another version, or other environments than before: install the same version for all processes, or create a
+    /// new connection.
     Incompatible,
     /// Raise a limit, or choose another directory: memory, descriptors or files are not available.
     Resources,
@@ -402,12 +403,12 @@ impl ServiceError {
             }
             E::UnknownEngine { .. } | E::EngineUnreachable { .. } | E::NamespaceLocked { .. } => ErrorKind::Unavailable,
             E::EngineExists { .. } | E::TrainerExists { .. } | E::TooManyObservers { .. } => ErrorKind::InUse,
-            E::EngineLost { .. }
-            | E::EngineRestarted { .. }
-            | E::SpecificationChanged { .. }
-            | E::RootRemoved { .. } => ErrorKind::Lost,
+            E::EngineLost { .. } | E::EngineRestarted { .. } | E::RootRemoved { .. } => ErrorKind::Lost,
             E::TimedOut { .. } => ErrorKind::TimedOut,
-            E::Version { .. } | E::IncompatibleTypes { .. } | E::Specification { .. } => ErrorKind::Incompatible,
+            E::Version { .. }
+            | E::IncompatibleTypes { .. }
+            | E::Specification { .. }
+            | E::SpecificationChanged { .. } => ErrorKind::Incompatible,
             E::Root { .. }
             | E::ForeignSegment { .. }
             | E::SharedMemoryTooSmall { .. }

@@ -43,7 +43,7 @@ pub(super) mod threads {
 
         /// Waits until the next poll.
         pub(in crate::pool) fn pause(&mut self) {
-            self.polls += 1;
+            self.polls = self.polls.wrapping_add(1);
             if self.waited >= self.spin {
                 thread::yield_now();
             } else {

@@ -82,8 +82,8 @@ impl Threads {
     }
 
     /// `count` threads as in [`new`](Threads::new), divided among callers that step pools of `num_envs` environments at the same
-    /// time: as many callers as get all threads that such a pool can use, at least 1 and at most `callers`. Each caller is one of
-    /// its threads.
+    /// time: as many callers as get all threads that such a pool can use, at least 1 and at most `callers`, and no more threads than
+    /// that. Each caller is one of its threads.
     ///
     /// # Errors
     ///
@@ -95,7 +95,7 @@ impl Threads {
     /// let counts = |num_envs, callers| -> Result<Vec<_>, endless_gym_core::pool::PoolError> {
     ///     Ok(Threads::divided(8, num_envs, callers)?.iter().map(Threads::count).collect())
     /// };
-    /// assert_eq!(counts(32, 3)?, [2, 3, 3]);
+    /// assert_eq!(counts(32, 3)?, [1, 1, 1]);
     /// assert_eq!(counts(64, 3)?, [4, 4]);
     /// assert_eq!(counts(1024, 3)?, [8]);
     /// # Ok::<(), endless_gym_core::pool::PoolError>(())
@@ -103,7 +103,8 @@ impl Threads {
     pub fn divided(count: usize, num_envs: usize, callers: usize) -> Result<Vec<Self>, PoolError> {
         let count = Self::resolve(count)?;
         let callers = (count / useful_threads(num_envs)).clamp(1, callers.max(1));
-        (0..callers).map(|caller| Self::start((count + caller) / callers, count, false)).collect()
+        let of = |caller: usize| ((count + caller) / callers).min(useful_threads(num_envs));
+        (0..callers).map(|caller| Self::start(of(caller), count, false)).collect()
     }
 
     /// Number of threads that step environments at the same time, including the calling one.

@@ -37,19 +37,21 @@ impl State {
     pub(super) fn is_valid(&self, config: &Config) -> bool {
         let (x, y) = self.agent.position;
         let centre = |(x, y): Tile| (x * TILE + TILE / 2, y * TILE + TILE / 2);
-        let end = |start: i32| (SCREEN as i32).max(start + config.agent.radius());
+        // A large agent may start beyond the border, which it keeps its distance from when it moves.
+        let (start_x, start_y) = self.origin(config);
+        let end = |start: i32| (SCREEN as i32).max(start);
         self.route.is_valid()
             && self.agent.is_valid()
             && self.tile == tile_at(self.agent.position)
             && match config.variant {
-                Variant::Free => x.min(y) >= 0 && x <= end(0) && y <= end(0),
+                Variant::Free => x.min(y) >= 0 && x <= end(start_x) && y <= end(start_y),
                 Variant::Grid => (x, y) == centre(self.tile) && TileSet::GRID.contains(self.tile),
                 // One step off the path, at the most.
                 Variant::Endless => {
                     x >= 0 && (-(SCREEN as i32)..=2 * SCREEN as i32 + config.agent.radius()).contains(&y)
                 }
             }
-            && self.endless.is_valid(&self.route, config, x - self.origin(config).0)
+            && self.endless.is_valid(&self.route, config, x - start_x)
             && (self.steps == 0 || self.success || self.off_path != self.route.contains(self.tile))
             && self.cross.is_none_or(|cross| self.off_path && cross == self.endless.on_screen(self.agent.position))
             && (0..i64::MAX / 2).contains(&self.steps)

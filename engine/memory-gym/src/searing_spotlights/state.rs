@@ -148,7 +148,7 @@ impl State {
             && self.last_action.iter().chain(&self.shown_action).all(|branch| (0..3).contains(branch))
             && (0..i64::MAX / 2).contains(&self.steps)
             && self.first_frame == (self.steps == 0)
-            && i64::from(self.coins_collected) <= self.steps.min(i64::from(u32::MAX / 2)).max(collected as i64)
+            && (!config.variant.endless || i64::from(self.coins_collected) <= self.steps.min(i64::from(u32::MAX / 2)))
             && (0..=parameters.num_spawns).contains(&self.spawns_left)
             && [self.spawn_timer, self.coin_steps].iter().all(|count| (0..=self.steps).contains(count))
     }

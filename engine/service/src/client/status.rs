@@ -12,6 +12,7 @@ use serde::Serialize;
 use crate::error::EngineActivity;
 use crate::namespace::directory::{Ipc, Namespace};
 use crate::namespace::identity::Identity;
+use crate::protocol::message::RequestKind;
 use crate::protocol::ports::SERVICE_PREFIX;
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, EngineRecord, GroupRecord, ObserverRecord, StatusReader, now, unpadded};
@@ -239,9 +240,19 @@ impl EngineMonitor {
         StatusReader::open(&path).map(EngineMonitor)
     }
 
-    /// The request that the engine is executing; [`EngineActivity::NotTaken`] if there is none.
-    pub fn activity(&self) -> EngineActivity {
-        activity(Some(&self.0), 0, 0, u64::MAX)
+    /// The request that the engine has been executing for the longest time, apart from saving checkpoints, which takes as long as
+    /// it takes; `None` if there is none.
+    pub fn longest(&self) -> Option<EngineActivity> {
+        let engine = self.0.engine()?;
+        let busy = (0..engine.groups as usize).filter_map(|group| {
+            let record = self.0.group(group)?;
+            let since = since(record.busy_since, now()).filter(|_| record.kind() != RequestKind::Checkpoint.name())?;
+            Some(EngineActivity::Busy { group, kind: record.kind(), since, process: engine.head.process })
+        });
+        busy.max_by_key(|activity| match activity {
+            EngineActivity::Busy { since, .. } => *since,
+            _ => Duration::ZERO,
+        })
     }
 }
 

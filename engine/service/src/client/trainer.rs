@@ -77,7 +77,8 @@ impl Trainer {
     pub fn group(&mut self, group: usize) -> Result<&mut TrainerGroup, ServiceError> {
         let (service, groups) = (&self.shared().config.service, self.groups.len());
         let missing = ServiceError::NoSuchGroup { service: service.clone(), given: group, groups };
-        self.groups.get_mut(group).ok_or(missing)
+        // Callers may have sorted them.
+        self.groups.iter_mut().find(|found| found.number() == group).ok_or(missing)
     }
 
     /// All groups, in the order of their numbers. The connection ends when the last one is dropped.

@@ -7,8 +7,8 @@
 use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{self, Mutex};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
@@ -260,7 +260,12 @@ impl Checkpointer {
 
     /// Saves in the background if a checkpoint is due.
     pub(crate) fn poll(&self, groups: &Groups, status: &StatusWriter) {
-        let mut saving = lock(&self.saving);
+        // While a trainer has a checkpoint saved, its groups are busy anyway.
+        let mut saving = match self.saving.try_lock() {
+            Ok(saving) => saving,
+            Err(sync::TryLockError::Poisoned(saving)) => saving.into_inner(),
+            Err(sync::TryLockError::WouldBlock) => return,
+        };
         if saving.writing.as_ref().is_some_and(JoinHandle::is_finished)
             && let Err(e) = self.finish(&mut saving, status)
         {
@@ -275,18 +280,23 @@ impl Checkpointer {
             Ok(saved) => saved,
             // No group was reset.
             Err(CheckpointError::NotReset) => return,
-            Err(e) => return tracing::error!(error = %e, "cannot save a checkpoint"),
+            Err(e) => {
+                self.mark_changed();
+                return tracing::error!(error = %e, "cannot save a checkpoint");
+            }
         };
         let (path, head) = (self.config.path.clone(), self.head.clone());
         let thread = std::thread::Builder::new().name("checkpoint".to_owned());
         match thread.spawn(move || write(&path, &head, saved)) {
             Ok(writing) => saving.writing = Some(writing),
-            Err(e) => tracing::error!(error = %e, "cannot start a thread to save a checkpoint"),
+            Err(e) => {
+                self.mark_changed();
+                tracing::error!(error = %e, "cannot start a thread to save a checkpoint");
+            }
         }
     }
 
-    /// Saves now, and returns when the checkpoint is on disk.
-    /// Returns the saved step of each group. The caller must not use a group.
+    /// Saves now, and returns the saved step of each group when the checkpoint is on disk. The caller must not use a group.
     pub(crate) fn save(&self, groups: &Groups, status: &StatusWriter) -> Result<Vec<u64>, CheckpointError> {
         let mut saving = lock(&self.saving);
         if let Err(e) = self.finish(&mut saving, status) {

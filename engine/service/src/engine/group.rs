@@ -365,8 +365,12 @@ impl Groups {
             if let Some(request) = group.poll()? {
                 return Ok(Some(Taken { number, group, request }));
             }
+            let is_saving = group.is_saving;
             drop(group);
-            self.wake(number);
+            // Who saves wakes them when it is done.
+            if !is_saving && self.has_request(number) {
+                self.wake(number);
+            }
         }
         Ok(None)
     }

@@ -179,7 +179,11 @@ impl Engine {
         discovery::refuse_second_engine(&node, &config.service, &node.lock()?)?;
         let pools = config.pools()?;
         let threads = Threads::divided(config.threads, config.pool.num_envs, config.groups)?;
-        let pools = || pools.iter().map(|pool| Pool::new(registry, pool, &threads[0])).collect::<Result<Vec<_>, _>>();
+        // Each group's pool has its server's threads, which prefault its memory.
+        let server =
+            |group| (0..threads.len()).rfind(|server| first_group(config, &threads, *server) <= group).unwrap_or(0);
+        let pool = |(group, pool)| Pool::new(registry, pool, &threads[server(group)]);
+        let pools = || pools.iter().enumerate().map(pool).collect::<Result<Vec<_>, _>>();
         let mut attempt = 1;
         loop {
             match Self::start(config, node, pools()?, &threads) {
@@ -224,10 +228,9 @@ impl Engine {
             .enumerate()
             .map(|(group, pool)| Group::new(&services, group, pool, limits))
             .collect::<Result<_, _>>()?;
-        let first = |server: usize| server * config.groups / threads.len();
-        let servers = threads.iter().enumerate().map(|(server, threads)| Server {
-            groups: first(server)..first(server + 1),
-            threads: threads.clone(),
+        let servers = threads.iter().enumerate().map(|(server, own)| Server {
+            groups: first_group(config, threads, server)..first_group(config, threads, server + 1),
+            threads: own.clone(),
             is_busy: AtomicBool::new(false),
         });
         let servers = servers.collect();
@@ -365,7 +368,10 @@ impl Engine {
                 }
             }
             if chores.is_some() {
+                // Drawing and saving wait for other groups, and for the disk.
+                is_busy.store(true, Ordering::SeqCst);
                 self.look_after_files();
+                is_busy.store(false, Ordering::SeqCst);
             }
         }
         Ok(())
@@ -404,6 +410,7 @@ impl Engine {
             saved = Some(self.save());
             group = self.groups.lock(number);
             group.set_saving(false);
+            self.groups.wake(number);
         }
         let mut batch = group.loan()?;
         let payload = bytemuck::cast_slice_mut(batch.payload_mut());
@@ -451,7 +458,7 @@ impl Engine {
             0
         });
         ports::notify(&self.to_trainer, number);
-        // After the trainer, which is one of the receivers.
+        // After the trainer, which is one of the receivers unless it has died.
         if receivers > 1 {
             self.status.ring(number);
         }
@@ -483,6 +490,11 @@ impl Engine {
             std::thread::sleep(Duration::from_millis(5));
         }
     }
+}
+
+/// The first group of a server.
+fn first_group(config: &EngineConfig, threads: &[Threads], server: usize) -> usize {
+    server * config.groups / threads.len()
 }
 
 fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, PoolError> {

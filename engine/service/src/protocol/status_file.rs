@@ -253,6 +253,8 @@ impl Bells {
         let mut count = [0; size_of::<u32>()];
         let offset = (words_before_bell(self.groups, bell) * WORD) as u64;
         let _ = self.status.file.read_exact_at(&mut count, offset);
+        // The queue of batches is read after it.
+        fence(Ordering::Acquire);
         u32::from_ne_bytes(count)
     }
 

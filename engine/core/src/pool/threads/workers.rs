@@ -50,6 +50,15 @@ pub(super) struct Workers {
     turn: Mutex<Turn>,
 }
 
+/// Sets a flag when it is dropped.
+struct SetOnDrop<'a>(&'a AtomicBool);
+
+impl Drop for SetOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Release);
+    }
+}
+
 /// What belongs to the caller whose turn it is.
 #[derive(Debug)]
 struct Turn {
@@ -130,8 +139,11 @@ impl Workers {
         let left =
             || done.iter().enumerate().filter(|(_, done)| !done.load(Ordering::Acquire)).map(|(thread, _)| thread);
         self.shared.call(count - 1, &|thread| {
-            work(thread);
-            done[thread].store(true, Ordering::Release);
+            {
+                // Also if `work` panics, which resumes in the caller.
+                let _done = SetOnDrop(&done[thread]);
+                work(thread);
+            }
             let mut wait = Wait::new(SPIN);
             while thread == 0 && wait.waited() < PATIENCE && left().next().is_some() {
                 wait.pause();
