@@ -8,7 +8,7 @@ use safetensors::tensor::{SafeTensorError, SafeTensors, TensorView};
 use serde::Deserialize;
 use thiserror::Error;
 
-/// Version of the files that [`write`] makes. The checksum of version 1 leaves out dtypes and shapes, and may be missing.
+/// Version of the files that [`write()`] makes. The checksum of version 1 leaves out dtypes and shapes, and may be missing.
 pub const VERSION: u32 = 2;
 /// Entries of the metadata.
 const HEADER: &str = "endless";
