@@ -31,7 +31,7 @@ impl DisplaySchedule {
             && self.frames == count * period
             && self.first.checked_add(count).is_some_and(|end| end <= commands)
             // Each view of the ground truth advances its schedule.
-            && self.frame < 1 << 32
+            && self.frame <= u32::MAX as usize
     }
 
     /// Index in the sequence of the first command to show.
