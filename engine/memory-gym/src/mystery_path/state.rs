@@ -37,11 +37,13 @@ impl State {
     pub(super) fn is_valid(&self, config: &Config) -> bool {
         let (x, y) = self.agent.position;
         let centre = |(x, y): Tile| (x * TILE + TILE / 2, y * TILE + TILE / 2);
+        if !self.route.is_valid() {
+            return false;
+        }
         // A large agent may start beyond the border, which it keeps its distance from when it moves.
         let (start_x, start_y) = self.origin(config);
         let end = |start: i32| (SCREEN as i32).max(start);
-        self.route.is_valid()
-            && self.agent.is_valid()
+        self.agent.is_valid()
             && self.tile == tile_at(self.agent.position)
             && match config.variant {
                 Variant::Free => x.min(y) >= 0 && x <= end(start_x) && y <= end(start_y),
