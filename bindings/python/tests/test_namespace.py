@@ -165,7 +165,7 @@ def group() -> Iterator[Callable[[str, int], Path]]:
 @pytest.mark.parametrize(
     ("controller", "limit", "num_envs", "message"),
     [
-        *(("pids", limit, 4, r"cannot start (a thread|[0-9] threads): Resource temporarily") for limit in range(1, 6)),
+        *(("pids", limit, 4, r"cannot start (a thread|[0-9] threads): Resource temporarily") for limit in range(1, 5)),
         ("memory", 200 << 20, 8192, "control group of this process .* is limited to 209 MB"),
         ("memory", 4 << 20, 4, "Killed, as the system does where a container or a batch job"),
     ],
