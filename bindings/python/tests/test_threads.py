@@ -20,11 +20,11 @@ import endless_gym
 COUNT = """
 import os, endless_gym
 from endless_gym import _native
-counts = [_native.cores()]
+counts, open_pools = [_native.cores()], []  # A closed pool's threads stay listed for a moment.
 for threads in (None, 3):
     before = len(os.listdir("/proc/self/task"))
-    with endless_gym.make_vec("MortarMayhem-Grid-v0", 4, threads):
-        counts.append(len(os.listdir("/proc/self/task")) - before)
+    open_pools.append(endless_gym.make_vec("MortarMayhem-Grid-v0", 4, threads))
+    counts.append(len(os.listdir("/proc/self/task")) - before)
 print(*counts)
 """
 
