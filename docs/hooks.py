@@ -47,7 +47,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def palette() -> str:
     """The colours of the page that plays, as variables of the theme's light and dark schemes."""
-    style = (ROOT / "engine/view/page/files/style.css").read_text()
+    style = (ROOT / "engine/page/files/style.css").read_text()
     colours = re.findall(r"(--[\w-]+): light-dark\((#\w+), (#\w+)\);", style)
     if not colours:
         raise PluginError(

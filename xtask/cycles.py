@@ -9,8 +9,8 @@ from pathlib import Path
 
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
 CRATES = [
-    "agents/kernels",
-    "agents/trainer",
+    "engine/kernels",
+    "engine/trainer",
     "bindings/web",
     "engine/cli",
     "engine/core",

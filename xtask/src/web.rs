@@ -1,5 +1,5 @@
 //! Builds the core for WebAssembly, and in target/web the page that plays the environments in a browser, from the core
-//! and the files of `engine/view/page/files`.
+//! and the files of `engine/page/files`.
 
 use std::fs;
 use std::io::Write;
@@ -110,7 +110,7 @@ pub fn build() -> Result<(), String> {
 
 /// The folder from which the program embeds the engine, `engine.wasm`.
 fn embedded() -> PathBuf {
-    workspace().join("engine/view/page/built")
+    workspace().join("engine/page/built")
 }
 
 /// Builds the page and the program, and plays in a browser. Without a compiler for WebAssembly, the program embeds an engine that was

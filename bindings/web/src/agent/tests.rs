@@ -14,7 +14,7 @@ use serde::Deserialize;
 
 use super::*;
 
-const AGENT: &[u8] = include_bytes!("../../../../engine/view/page/files/MortarMayhem-Grid-v0.safetensors");
+const AGENT: &[u8] = include_bytes!("../../../../engine/page/files/MortarMayhem-Grid-v0.safetensors");
 
 /// Recorded by `python -m endless_gym_agents.export --vectors`.
 #[derive(Deserialize)]
@@ -34,7 +34,7 @@ fn largest_difference(found: &[f32], expected: &[f32]) -> f32 {
 
 #[test]
 fn the_networks_compute_what_pytorch_computes() {
-    let (of_the_page, of_tests) = ("../../engine/view/page/files", "tests/agents");
+    let (of_the_page, of_tests) = ("../../engine/page/files", "tests/agents");
     for (folder, name) in [
         (of_the_page, "MortarMayhem-Grid-v0"),
         (of_the_page, "MysteryPath-Grid-v0"),
