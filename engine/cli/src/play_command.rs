@@ -1,7 +1,7 @@
 //! `endless play`: an environment for a person, on a page or in the terminal.
 
 use endless_gym_core::pool::{PoolConfig, Registry, ResetOptions};
-use endless_gym_view::PlayServer;
+use endless_gym_page::PlayServer;
 
 use super::failure::Failure;
 use super::options::parameters;

@@ -2,73 +2,23 @@
 //!
 //! `cargo xtask web` builds the engine with the environments of Memory Gym as WebAssembly into this package's folder `built`.
 //! Later release builds of this crate contain it. Other builds contain only the other files.
+//!
+//! With the feature `server`, [`PlayServer`] serves the page, and [`server`] has what other web servers of a program share
+//! with it. They listen on 127.0.0.1 or where the user says, refuse requests that come from another site's page and, on an
+//! address of this host only, those that name another host. Each has a limited number of connections and threads.
 
-use std::io::Read;
+#![deny(unsafe_code)]
 
-use flate2::read::GzDecoder;
+#[cfg(feature = "server")]
+mod error;
+mod files;
+#[cfg(feature = "server")]
+mod play;
+#[cfg(feature = "server")]
+pub mod server;
 
-/// Names and contents of the files, each compressed with gzip.
-pub const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
-
-const ENGINE: &str = "engine.wasm";
-
-/// The service worker, which lacks the list of the files that it caches.
-const WORKER: &str = "worker.js";
-
-/// The end of the name of a trained agent's file, after the id of its environment.
-const AGENT: &str = ".safetensors";
-
-/// The file of that name, such as `index.html`, compressed with gzip.
-///
-/// ```
-/// let file = endless_gym_page::file("index.html").unwrap();
-/// assert!(endless_gym_page::decompress(file).starts_with(b"<!doctype html>"));
-/// assert!(endless_gym_page::file("../Cargo.toml").is_none());
-/// ```
-pub fn file(name: &str) -> Option<&'static [u8]> {
-    FILES.iter().find_map(|(other, bytes)| (*other == name).then_some(*bytes))
-}
-
-/// The contents of one of the compressed files; empty for other bytes.
-pub fn decompress(file: &[u8]) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    // Reading from memory fails only for bytes that were not compressed.
-    GzDecoder::new(file).read_to_end(&mut bytes).map_or_else(|_| Vec::new(), |_| bytes)
-}
-
-/// The engine of the page, if it was built before this crate. Without it, the page cannot be played.
-pub fn engine() -> Option<Vec<u8>> {
-    file(ENGINE).map(decompress)
-}
-
-/// Whether an engine contains the text of an id. One that does not cannot have the environment.
-///
-/// ```
-/// assert!(endless_gym_page::names(b"\0asm..TMaze-v0..", "TMaze-v0"));
-/// assert!(!endless_gym_page::names(b"\0asm..TMaze-v0..", "Maze-v1"));
-/// ```
-pub fn names(engine: &[u8], id: &str) -> bool {
-    engine.windows(id.len().max(1)).any(|part| part == id.as_bytes())
-}
-
-/// Names and contents of all files of a page with another engine, for any web server. `has_id` says whether the engine has an
-/// environment: agents of others are left out.
-///
-/// ```
-/// let files = endless_gym_page::files(b"\0asm", |_| false);
-/// let (_, worker) = files.iter().find(|(name, _)| *name == "worker.js").unwrap();
-/// assert!(worker.starts_with(b"const VERSION = \""));
-/// ```
-pub fn files(engine: &[u8], has_id: impl Fn(&str) -> bool) -> Vec<(&'static str, Vec<u8>)> {
-    let is_kept = |name: &str| name != ENGINE && name.strip_suffix(AGENT).is_none_or(&has_id);
-    let sources = FILES.iter().filter(|(name, _)| is_kept(name)).map(|(name, bytes)| (*name, decompress(bytes)));
-    let mut files: Vec<_> = sources.chain([(ENGINE, engine.to_vec())]).collect();
-    let mut checksum = crc32fast::Hasher::new();
-    files.iter().for_each(|(_, bytes)| checksum.update(bytes));
-    let names: Vec<&str> = files.iter().map(|(name, _)| *name).filter(|name| *name != WORKER).collect();
-    let lines = format!("const VERSION = \"{:08x}\";\nconst FILES = {names:?};\n", checksum.finalize());
-    for (_, worker) in files.iter_mut().filter(|(name, _)| *name == WORKER) {
-        worker.splice(0..0, lines.bytes());
-    }
-    files
-}
+#[cfg(feature = "server")]
+pub use error::ServerError;
+pub use files::{FILES, decompress, engine, file, files, names};
+#[cfg(feature = "server")]
+pub use play::PlayServer;

@@ -10,10 +10,10 @@ use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use endless_gym_page::ServerError;
+use endless_gym_page::server::Port;
 use endless_gym_service::{EngineStatus, GroupStatus, Namespace};
 
-use crate::error::ViewError;
-use crate::server::Port;
 
 /// Prometheus' text format.
 const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
@@ -43,8 +43,8 @@ impl MetricsServer {
     ///
     /// # Errors
     ///
-    /// [`ViewError::Server`] if the operating system refuses threads or descriptors.
-    pub fn run(self, namespace: Namespace, service: String) -> Result<(), ViewError> {
+    /// [`ServerError::Server`] if the operating system refuses threads or descriptors.
+    pub fn run(self, namespace: Namespace, service: String) -> Result<(), ServerError> {
         let metrics = move || future::ready(answer(&namespace, &service));
         let router = Router::new()
             .route("/metrics", get(metrics))

@@ -14,6 +14,8 @@ use axum::http::{HeaderMap, StatusCode, Uri};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use endless_gym_page::ServerError;
+use endless_gym_page::server::{self, Port};
 use endless_gym_service::Namespace;
 use serde::Deserialize;
 use serde_json::json;
@@ -21,8 +23,6 @@ use tokio::time::timeout;
 
 use crate::channel::{Channel, Connected};
 use crate::engines;
-use crate::error::ViewError;
-use crate::server::{self, Port};
 use crate::watcher;
 
 /// The page's own files. It shares style and icon with the page that plays the environments.
@@ -62,7 +62,7 @@ const SEND_TIMEOUT: Duration = Duration::from_secs(60);
 /// let server = ViewServer::bind(0, Namespace::default(), Some("endless"))?;
 /// println!("{}", server.url());
 /// server.run(&AtomicBool::new(false))?;
-/// # Ok::<(), endless_gym_view::ViewError>(())
+/// # Ok::<(), endless_gym_page::ServerError>(())
 /// ```
 pub struct ViewServer {
     port: Port,
@@ -84,8 +84,8 @@ impl ViewServer {
     ///
     /// # Errors
     ///
-    /// [`ViewError::Port`] if the port is taken.
-    pub fn bind(port: u16, namespace: Namespace, service: Option<&str>) -> Result<Self, ViewError> {
+    /// [`ServerError::Port`] if the port is taken.
+    pub fn bind(port: u16, namespace: Namespace, service: Option<&str>) -> Result<Self, ServerError> {
         let token = format!("{:032x}", rand::random::<u128>());
         let (service, channels) = (service.map(str::to_owned), Mutex::default());
         let shared = Arc::new(Shared { namespace, service, token, channels });
@@ -101,8 +101,8 @@ impl ViewServer {
     ///
     /// # Errors
     ///
-    /// [`ViewError::Server`] if the operating system refuses threads or descriptors.
-    pub fn run(self, stop: &AtomicBool) -> Result<(), ViewError> {
+    /// [`ServerError::Server`] if the operating system refuses threads or descriptors.
+    pub fn run(self, stop: &AtomicBool) -> Result<(), ServerError> {
         let shared = self.shared;
         let router = Router::new()
             .route("/", get(index))

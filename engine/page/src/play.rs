@@ -8,7 +8,8 @@ use axum::response::{IntoResponse, Response};
 use form_urlencoded::Serializer;
 use serde_json::{Map, Value as Json};
 
-use crate::error::ViewError;
+use crate::error::ServerError;
+use crate::files;
 use crate::server::{self, Port};
 
 /// A service worker that replaces and unregisters one installed earlier at this address. The page's own worker caches
@@ -21,12 +22,12 @@ const WORKER: &str = "addEventListener('install', () => skipWaiting());\n\
 /// ```no_run
 /// use std::sync::atomic::AtomicBool;
 ///
-/// use endless_gym_view::PlayServer;
+/// use endless_gym_page::PlayServer;
 ///
 /// let server = PlayServer::bind(0, "MysteryPath-v0")?;
 /// println!("{}", server.url("MysteryPath-v0", &serde_json::Map::new(), Some(7)));
 /// server.run(&AtomicBool::new(false))?;
-/// # Ok::<(), endless_gym_view::ViewError>(())
+/// # Ok::<(), endless_gym_page::ServerError>(())
 /// ```
 #[derive(Debug)]
 pub struct PlayServer {
@@ -38,10 +39,10 @@ impl PlayServer {
     ///
     /// # Errors
     ///
-    /// [`ViewError::PageNotBuilt`] if this program was built without the page, [`ViewError::NotOnPage`] if its page does not have the
-    /// environment, and [`ViewError::Port`] if the port is taken.
-    pub fn bind(port: u16, id: &str) -> Result<Self, ViewError> {
-        check(endless_gym_page::engine().as_deref(), id)?;
+    /// [`ServerError::PageNotBuilt`] if this program was built without the page, [`ServerError::NotOnPage`] if its page does not have the
+    /// environment, and [`ServerError::Port`] if the port is taken.
+    pub fn bind(port: u16, id: &str) -> Result<Self, ServerError> {
+        check(files::engine().as_deref(), id)?;
         Ok(PlayServer { port: Port::local(port)? })
     }
 
@@ -54,16 +55,16 @@ impl PlayServer {
     ///
     /// # Errors
     ///
-    /// [`ViewError::Server`] if the operating system refuses threads or descriptors.
-    pub fn run(self, stop: &AtomicBool) -> Result<(), ViewError> {
+    /// [`ServerError::Server`] if the operating system refuses threads or descriptors.
+    pub fn run(self, stop: &AtomicBool) -> Result<(), ServerError> {
         self.port.serve(Router::new().fallback(answer), server::is_set(stop))
     }
 }
 
 /// Checks that the page's engine has an environment.
-fn check(engine: Option<&[u8]>, id: &str) -> Result<(), ViewError> {
-    let is_on_page = endless_gym_page::names(engine.ok_or(ViewError::PageNotBuilt)?, id);
-    is_on_page.then_some(()).ok_or_else(|| ViewError::NotOnPage { id: id.to_owned() })
+fn check(engine: Option<&[u8]>, id: &str) -> Result<(), ServerError> {
+    let is_on_page = files::names(engine.ok_or(ServerError::PageNotBuilt)?, id);
+    is_on_page.then_some(()).ok_or_else(|| ServerError::NotOnPage { id: id.to_owned() })
 }
 
 async fn answer(method: Method, headers: HeaderMap, address: Uri) -> Response {
@@ -78,7 +79,7 @@ async fn answer(method: Method, headers: HeaderMap, address: Uri) -> Response {
 }
 
 fn found(headers: &HeaderMap, name: &str) -> Response {
-    let file = endless_gym_page::file(name);
+    let file = files::file(name);
     file.map_or_else(server::not_found, |bytes| server::compressed(headers, name, bytes))
 }
 
@@ -137,7 +138,7 @@ mod tests {
     #[test]
     fn the_pages_files_are_served_and_nothing_else() {
         let kind = |response: &Response| response.headers()["content-type"].to_str().unwrap().to_owned();
-        for (name, _) in endless_gym_page::FILES {
+        for (name, _) in files::FILES {
             assert_eq!(answered(Method::GET, &format!("/{name}")).status(), StatusCode::OK, "{name}");
         }
         assert_eq!(kind(&answered(Method::GET, "/")), "text/html; charset=utf-8");

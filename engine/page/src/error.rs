@@ -2,7 +2,7 @@
 
 /// Why a page cannot be served.
 #[derive(Debug, thiserror::Error)]
-pub enum ViewError {
+pub enum ServerError {
     /// The port cannot be used.
     #[error("cannot listen on 127.0.0.1:{port}: {reason}; give another --port, or 0 for any that is free")]
     Port {

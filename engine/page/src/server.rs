@@ -1,4 +1,4 @@
-//! Common parts of this crate's servers: a port with a limited number of connections, the check of a request's origin,
+//! Common parts of the web servers: a port with a limited number of connections, the check of a request's origin,
 //! and files.
 
 use std::collections::VecDeque;
@@ -25,7 +25,8 @@ use tokio::net::TcpStream;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use crate::error::ViewError;
+use crate::error::ServerError;
+use crate::files::decompress;
 
 /// Maximum number of HTTP connections. Another one closes the oldest, so that idle clients keep nobody out.
 const MAX_CONNECTIONS: usize = 64;
@@ -50,7 +51,7 @@ const STOP_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A port on which a server listens.
 #[derive(Debug)]
-pub(crate) struct Port {
+pub struct Port {
     listener: TcpListener,
     address: SocketAddr,
 }
@@ -64,8 +65,8 @@ impl Port {
     }
 
     /// Binds a port on 127.0.0.1; 0 for any free one.
-    pub fn local(port: u16) -> Result<Self, ViewError> {
-        Port::bind((Ipv4Addr::LOCALHOST, port).into()).map_err(|reason| ViewError::Port { port, reason })
+    pub fn local(port: u16) -> Result<Self, ServerError> {
+        Port::bind((Ipv4Addr::LOCALHOST, port).into()).map_err(|reason| ServerError::Port { port, reason })
     }
 
     /// `http://ADDRESS/`.
@@ -74,10 +75,10 @@ impl Port {
     }
 
     /// Serves in this thread until `stopped` is ready, and then closes open connections.
-    pub fn serve(self, router: Router, stopped: impl Future<Output = ()>) -> Result<(), ViewError> {
+    pub fn serve(self, router: Router, stopped: impl Future<Output = ()>) -> Result<(), ServerError> {
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(BLOCKING_THREADS).build();
-        let runtime = runtime.map_err(|reason| ViewError::Server { reason })?;
+        let runtime = runtime.map_err(|reason| ServerError::Server { reason })?;
         // Other names may lead to an address that other hosts reach.
         let hosts = self
             .address
@@ -98,12 +99,12 @@ impl Port {
         });
         // Blocking tasks that still run have no visible effect.
         runtime.shutdown_background();
-        served.map_err(|reason| ViewError::Server { reason })
+        served.map_err(|reason| ServerError::Server { reason })
     }
 }
 
 /// Waits until the flag is set.
-pub(crate) async fn is_set(stop: &AtomicBool) {
+pub async fn is_set(stop: &AtomicBool) {
     while !stop.load(Ordering::Relaxed) {
         sleep(STOP_INTERVAL).await;
     }
@@ -163,12 +164,12 @@ fn refusal(headers: &HeaderMap, hosts: Option<&[String; 2]>) -> Option<&'static 
 }
 
 /// The answer 403.
-pub(crate) fn refuse(why: &'static str) -> Response {
+pub fn refuse(why: &'static str) -> Response {
     protected((StatusCode::FORBIDDEN, format!("{why}\n")).into_response())
 }
 
 /// The answer 404.
-pub(crate) fn not_found() -> Response {
+pub fn not_found() -> Response {
     (StatusCode::NOT_FOUND, "there is no such file\n").into_response()
 }
 
@@ -182,18 +183,18 @@ fn protected(mut response: Response) -> Response {
 }
 
 /// Answers with a file.
-pub(crate) fn file(name: &str, bytes: &'static [u8]) -> Response {
+pub fn file(name: &str, bytes: &'static [u8]) -> Response {
     ([(CONTENT_TYPE, HeaderValue::from_static(content_type(name)))], Body::from(bytes)).into_response()
 }
 
 /// Answers with a file that is compressed with gzip, and sends it so to clients that take it.
-pub(crate) fn compressed(headers: &HeaderMap, name: &str, bytes: &'static [u8]) -> Response {
+pub fn compressed(headers: &HeaderMap, name: &str, bytes: &'static [u8]) -> Response {
     let accepted = headers.get(ACCEPT_ENCODING).and_then(|value| value.to_str().ok()).unwrap_or_default();
     let content_type = [(CONTENT_TYPE, content_type(name))];
     if accepted.split(',').any(|encoding| encoding.trim() == "gzip") {
         return (content_type, [(CONTENT_ENCODING, "gzip")], bytes).into_response();
     }
-    (content_type, endless_gym_page::decompress(bytes)).into_response()
+    (content_type, decompress(bytes)).into_response()
 }
 
 /// The type of a file by its name.
