@@ -1,12 +1,18 @@
-"""Fail if the files of a crate or of a Python package import each other in a cycle: `python xtask/cycles.py`."""
+"""Fail if files of a crate or a Python package import each other in a cycle, or if a folder imports one above it.
+
+Run `python xtask/cycles.py`.
+"""
 
 import ast
 import re
 import sys
+import tomllib
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+#: The folders with code, each of which uses only itself and those before it, in Rust and in Python.
+FLOORS = ["engine", "src", "bindings", "agents"]
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
 CRATES = [
     "engine/kernels",
@@ -120,7 +126,32 @@ def python_imports(folder: Path) -> dict[Module, set[Module]]:
     return found
 
 
+def upward_imports() -> Iterator[str]:
+    """Crates and Python files of a floor that depend on a crate or a package of a higher one."""
+    crates = {tomllib.loads(path.read_text())["package"]["name"]: floor for floor in FLOORS for path in manifests(floor)}
+    packages = {Path(package).name: package.split("/")[0] for package in PACKAGES}
+    for floor in FLOORS:
+        above = FLOORS[FLOORS.index(floor) + 1 :]
+        for path in manifests(floor):
+            manifest = tomllib.loads(path.read_text())
+            for kind in ("dependencies", "dev-dependencies", "build-dependencies"):
+                yield from (f"{path}: {name}" for name in manifest.get(kind, {}) if crates.get(name) in above)
+        for package in PACKAGES:
+            if package.startswith(floor):
+                for path in Path(package).rglob("*.py"):
+                    imported = re.findall(r"^\s*(?:from|import) (\w+)", path.read_text(), re.MULTILINE)
+                    yield from (f"{path}: {name}" for name in imported if packages.get(name) in above)
+
+
+def manifests(floor: str) -> list[Path]:
+    """The manifests of a floor's crates; that of `src` is the root's."""
+    return [Path("Cargo.toml")] if floor == "src" else [path for path in sorted(Path(floor).glob("*/Cargo.toml"))]
+
+
 failed = False
+for upward in upward_imports():
+    failed = True
+    print(f"{upward} is of a higher folder")
 for folder, imports in [
     *((Path(crate, "src"), rust_imports) for crate in CRATES),
     *((Path(package), python_imports) for package in PACKAGES),

@@ -1,4 +1,4 @@
-//! Tests that the programs of `engine/examples` run and print what they should.
+//! Tests that the programs of `docs/examples` run and print what they should.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};

@@ -1,6 +1,6 @@
 //! Tests that a custom environment, the T-maze of the examples, has all features of a built-in one.
 
-#[path = "../../engine/examples/t_maze/task.rs"]
+#[path = "../../docs/examples/t_maze/task.rs"]
 #[allow(dead_code)]
 mod t_maze;
 

@@ -166,7 +166,7 @@ pub fn lint() -> Result<(), String> {
     run(Command::new(&ruff).arg("check").current_dir(workspace()))
 }
 
-/// Fails if the files of a crate or of a Python package import each other in a cycle.
+/// Fails if files import each other in a cycle, or if a folder imports one above it.
 pub fn cycles() -> Result<(), String> {
     run(Command::new(base()?).arg("xtask/cycles.py").current_dir(workspace()))
 }

@@ -150,7 +150,7 @@ def test_blocks_have_a_known_language() -> None:
         for block in found:
             assert block.language in LANGUAGES, block.name
             # The integration tests run the examples.
-            assert block.language != "rust", f"{block.name}: link a file of engine/examples instead"
+            assert block.language != "rust", f"{block.name}: link a file of docs/examples instead"
 
 
 def test_snippets_of_docstrings_define_their_names() -> None:
@@ -207,7 +207,7 @@ def test_links_lead_to_files() -> None:
 
 
 def test_named_files_exist() -> None:
-    """Paths in inline code, such as `engine/examples/trainer.rs`."""
+    """Paths in inline code, such as `docs/examples/trainer.rs`."""
     folders = "|".join(sorted(path.name for path in ROOT.iterdir() if path.is_dir() and path.name != "target"))
     path = re.compile(rf"`((?:{folders})/[\w./-]+)`")
     broken = [

@@ -1,0 +1,1 @@
+../../../engine/cli/template/src/task.rs

@@ -1,1 +1,0 @@
-../../cli/template/src/task.rs
