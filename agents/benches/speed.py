@@ -1,4 +1,4 @@
-"""End-to-end training throughput on the CPU: `endless-train` compared with CleanRL's ppo_trxl and a plain recurrent PPO.
+"""End-to-end training throughput on the CPU: `endless-train` compared with CleanRL's ppo_trxl.
 
     python speed.py --original PYTHON --cleanrl FOLDER
 
@@ -20,10 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-import endless_gym
 from endless_gym_agents import atomic
-
-HERE = Path(__file__).parent
 
 
 def cpu_seconds(session: int) -> float:
@@ -74,9 +71,7 @@ def main() -> None:
     """Measure, print and write the throughput."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--original", required=True, help="Python interpreter with the original")
-    parser.add_argument(
-        "--cleanrl", default="", help="CleanRL's folder ppo_trxl; without it, only the GRU agent is measured"
-    )
+    parser.add_argument("--cleanrl", type=Path, required=True, help="CleanRL's folder ppo_trxl")
     parser.add_argument("--env", default="Endless-MortarMayhem-v0", help="environment id (default: %(default)s)")
     parser.add_argument("--num-envs", type=int, default=8, help="number of environments (default: %(default)s)")
     parser.add_argument(
@@ -89,60 +84,47 @@ def main() -> None:
     parser.add_argument(
         "--threads", type=int, default=1, help="CPU threads of PyTorch and of the engine (default: %(default)s)"
     )
-    parser.add_argument(
-        "--bf16", action="store_true", help="`endless-train` computes in bfloat16, the others in float32"
-    )
+    parser.add_argument("--bf16", action="store_true", help="`endless-train` computes in bfloat16, CleanRL in float32")
     parser.add_argument("--rounds", type=int, default=2, help="runs of each program (default: %(default)s)")
     parser.add_argument("--output", type=Path, help="also write the results to this JSON file")
     args = parser.parse_args()
-    batch, rows, branches = args.num_envs * args.steps, [], endless_gym.spec(args.env).branches
-    for name in ("trxl", "gru") if args.cleanrl else ("gru",):
-        sides: dict[str, list[tuple[float, float]]] = {"endless": [], "other": []}
-        shares: dict[str, float] = {}
-        for _ in range(args.rounds):
-            with tempfile.TemporaryDirectory() as folder:
-                ours = [
-                    *(sys.executable, "-m", "endless_gym_agents.train", "--env", args.env, "--agent", name),
-                    *(f"--environment.num-envs={args.num_envs}", "--environment.groups=1", f"--ppo.steps={args.steps}"),
-                    *(f"--ppo.updates={args.updates}", f"--transformer.window={args.window}", "--device=cpu"),
-                    *(f"--threads={args.threads}", f"--environment.num-threads={args.threads}", f"--run={folder}/run"),
-                    *(["--bf16"] if args.bf16 else []),
-                ]
-                sides["endless"].append(rate(timed(ours, args.threads, r"steps/s|/s  ", folder), batch))
-                lines = Path(f"{folder}/run/progress.jsonl").read_text().splitlines()
-                progress = [json.loads(line) for line in lines][1:]
-                spent = {
-                    key[8:]: sum(row[key] for row in progress) for key in progress[0] if key.startswith("seconds/")
-                }
-                shares = {key: seconds / sum(spent.values()) for key, seconds in spent.items()}
-                if name == "trxl":
-                    other = [
-                        *(args.original, str(Path(args.cleanrl).resolve() / "ppo_trxl.py"), "--env-id", args.env),
-                        *(f"--num-envs={args.num_envs}", f"--num-steps={args.steps}", "--no-cuda"),
-                        *(f"--total-timesteps={batch * args.updates}", f"--trxl-memory-length={args.window}"),
-                    ]
-                    pattern = r"SPS="
-                else:
-                    other = [
-                        *(args.original, str(HERE / "plain_recurrent.py"), "--env", args.env),
-                        *(f"--num-envs={args.num_envs}", f"--steps={args.steps}", f"--updates={args.updates}"),
-                        *(f"--threads={args.threads}", f"--branches={','.join(map(str, branches))}"),
-                    ]
-                    pattern = r"steps="
-                sides["other"].append(rate(timed(other, args.threads, pattern, folder), batch))
-        against = "CleanRL ppo_trxl" if name == "trxl" else "plain recurrent PPO"
-        row = {"agent": name, "against": against, "rounds": sides, "shares_of_time": shares, "load": os.getloadavg()[0]}
-        for column, unit in enumerate(("second", "CPU second")):
-            one, two = (statistics.median(pair[column] for pair in sides[side]) for side in ("endless", "other"))
-            row[f"steps per {unit}"] = {"endless-train": one, "other": two, "times": one / two}
-            print(f"{name}: {one:.1f} steps per {unit}, {against} {two:.1f}: {one / two:.1f} times", flush=True)
-        print(f"{name}: " + ", ".join(f"{key} {share:.1%}" for key, share in shares.items()), flush=True)
-        rows.append(row)
+    batch = args.num_envs * args.steps
+    sides: dict[str, list[tuple[float, float]]] = {"endless": [], "other": []}
+    shares: dict[str, float] = {}
+    for _ in range(args.rounds):
+        with tempfile.TemporaryDirectory() as folder:
+            ours = [
+                *(sys.executable, "-m", "endless_gym_agents.train", "--env", args.env, "--agent", "trxl"),
+                *(f"--environment.num-envs={args.num_envs}", "--environment.groups=1", f"--ppo.steps={args.steps}"),
+                *(f"--ppo.updates={args.updates}", f"--transformer.window={args.window}", "--device=cpu"),
+                *(f"--threads={args.threads}", f"--environment.num-threads={args.threads}", f"--run={folder}/run"),
+                *(["--bf16"] if args.bf16 else []),
+            ]
+            sides["endless"].append(rate(timed(ours, args.threads, r"steps/s|/s  ", folder), batch))
+            lines = Path(f"{folder}/run/progress.jsonl").read_text().splitlines()
+            progress = [json.loads(line) for line in lines][1:]
+            spent = {key[8:]: sum(row[key] for row in progress) for key in progress[0] if key.startswith("seconds/")}
+            shares = {key: seconds / sum(spent.values()) for key, seconds in spent.items()}
+            other = [
+                *(args.original, str(args.cleanrl.resolve() / "ppo_trxl.py"), "--env-id", args.env),
+                *(f"--num-envs={args.num_envs}", f"--num-steps={args.steps}", "--no-cuda"),
+                *(f"--total-timesteps={batch * args.updates}", f"--trxl-memory-length={args.window}"),
+            ]
+            sides["other"].append(rate(timed(other, args.threads, r"SPS=", folder), batch))
+    row = {
+        **{"agent": "trxl", "against": "CleanRL ppo_trxl", "rounds": sides},
+        **{"shares_of_time": shares, "load": os.getloadavg()[0]},
+    }
+    for column, unit in enumerate(("second", "CPU second")):
+        one, two = (statistics.median(pair[column] for pair in sides[side]) for side in ("endless", "other"))
+        row[f"steps per {unit}"] = {"endless-train": one, "other": two, "times": one / two}
+        print(f"{one:.1f} steps per {unit}, CleanRL ppo_trxl {two:.1f}: {one / two:.1f} times", flush=True)
+    print(", ".join(f"{key} {share:.1%}" for key, share in shares.items()), flush=True)
     if args.output:
         settings = {
             key: str(value) for key, value in vars(args).items() if key not in ("original", "cleanrl", "output")
         }
-        atomic.write(args.output, json.dumps({"settings": settings, "results": rows}, indent=1) + "\n")
+        atomic.write(args.output, json.dumps({"settings": settings, "results": [row]}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
