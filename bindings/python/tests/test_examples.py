@@ -93,7 +93,7 @@ def test_example_runs(tmp_path, request, example, env_id, printed):
     assert not segments()
 
 
-@pytest.mark.parametrize("script", ["cleanrl_ppo.py", "torchrl_rollout.py", "rllib_ppo.py"])
+@pytest.mark.parametrize("script", ["torchrl_rollout.py", "rllib_ppo.py"])
 def test_dict_observations_are_refused_with_a_message(script, tmp_path, libraries_python):
     python = libraries_python if script == "rllib_ppo.py" else sys.executable
     command = [python, EXAMPLES / script, "--env-id", "MortarMayhemB-v0"]
@@ -103,15 +103,8 @@ def test_dict_observations_are_refused_with_a_message(script, tmp_path, librarie
     assert "Traceback" not in ran.stderr
 
 
-def test_cleanrl_ppo_needs_steps_for_one_update(tmp_path):
-    command = [sys.executable, EXAMPLES / "cleanrl_ppo.py", "--total-timesteps", "100"]
-    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert ran.returncode
-    assert "--total-timesteps must be at least num_envs * num_steps, 8192" in ran.stderr
-
-
 @pytest.mark.parametrize(
-    "script", ["cleanrl_ppo.py", "jax_service.py", "pufferlib_rollout.py", "sb3_recurrent_ppo.py", "torchrl_rollout.py"]
+    "script", ["jax_service.py", "pufferlib_rollout.py", "sb3_recurrent_ppo.py", "torchrl_rollout.py"]
 )
 def test_command_lines_in_docstrings_work(tmp_path, libraries_python, script):
     """The commands run with fewer steps. The other examples have their own tests."""
@@ -125,22 +118,9 @@ def test_command_lines_in_docstrings_work(tmp_path, libraries_python, script):
         assert int(summary[1]) >= 512
 
 
-def test_cleanrl_ppo(tmp_path):
-    sizes = ("--num-envs", "8", "--num-steps", "32", "--num-minibatches", "2", "--update-epochs", "1")
-    output, summary = run(
-        "cleanrl_ppo.py", tmp_path, "--env-id", GRID_ID, "--total-timesteps", "512", "--hidden-size", "32", *sizes
-    )
-    assert summary[1] == "512"
-    assert output.count("steps=") >= 2
-    losses = [float(loss) for loss in re.findall(r"loss=(\S+)", output)]
-    assert len(losses) == 2
-    assert not any(math.isnan(loss) for loss in losses)
-
-
 @pytest.mark.parametrize(
     "example",
     [
-        "cleanrl_ppo.py --num-envs 2 --num-minibatches 2 --num-steps 1 --total-timesteps 4",
         "ppo_gru.py --num-envs 2 --num-minibatches 2 --num-steps 1 --total-timesteps 4 --autoreset same_step",
         # After the end of an episode, one of two steps is masked.
         "ppo_gru.py --num-envs 2 --num-minibatches 2 --num-steps 2 --total-timesteps 400 --autoreset next_step",
