@@ -22,11 +22,11 @@ def test_the_memories_of_the_package_pass(name: str) -> None:
     assert ("gradient" in names) == ("trxl" not in name)
 
 
-def test_the_memory_of_the_documentation_passes(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "train" / "memories.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "average.py").write_text(block)
-    assert all(result.passed for result in conformance.check(f"{tmp_path}/average.py:Average"))
+@pytest.mark.parametrize(("page", "name"), [("memories", "Average"), ("own-agents", "MinGRU")])
+def test_the_memories_of_the_documentation_pass(page: str, name: str, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "train" / f"{page}.md").read_text()
+    (tmp_path / "own.py").write_text(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0])
+    assert all(result.passed for result in conformance.check(f"{tmp_path}/own.py:{name}"))
 
 
 MISTAKES = '''

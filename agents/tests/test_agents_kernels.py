@@ -1,4 +1,4 @@
-"""The native kernels have the same outputs and gradients as PyTorch's layers."""
+"""The layers over packed sequences, native and not, have the same outputs and gradients as PyTorch's layers."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym import _native
-from endless_gym_agents.kernels import KernelGRU, KernelLSTM, KernelMinGRU
+from endless_gym_agents.kernels import KernelGRU, KernelMinGRU
+from endless_gym_agents.recurrence import packed_layers
 
 
 def batches() -> list[tuple[int, list[int]]]:
@@ -46,31 +47,29 @@ def check(named: dict[str, Tensor], output: Tensor, expected: Tensor) -> None:
 
 
 @pytest.mark.parametrize("shape", batches(), ids=str)
-@pytest.mark.parametrize("kind", ["gru", "lstm", "mingru"])
-def test_outputs_and_gradients_equal_those_of_pytorch(kind: str, shape: tuple[int, list[int]]) -> None:
+@pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
+@pytest.mark.parametrize("native", [False, True])
+def test_layers_equal_those_of_pytorch(
+    native: bool, kind: type[nn.GRU] | type[nn.LSTM], shape: tuple[int, list[int]]
+) -> None:
     width, sizes = shape
     torch.manual_seed(1)
-    parts = 2 if kind == "lstm" else 1
-    states = [torch.randn(sizes[0], width, requires_grad=True) for _ in range(parts)]
-    if kind == "mingru":
-        inputs = torch.randn(sum(sizes), 2 * width, requires_grad=True)
-        output, expected = KernelMinGRU.apply(inputs, *states, sizes), min_gru(inputs, *states, sizes)
-        return check({"inputs": inputs, "hidden": states[0]}, output, expected)
-    layer = (nn.LSTM if kind == "lstm" else nn.GRU)(5, width)
+    layers = kind(5, width, num_layers=2)
     x = torch.randn(sum(sizes), 5, requires_grad=True)
-    weight_ih, weight_hh, bias_ih, bias_hh = layer.all_weights[0]
-    hidden = [state.unsqueeze(0) for state in states]
-    expected = layer(PackedSequence(x, torch.tensor(sizes)), tuple(hidden) if kind == "lstm" else hidden[0])[0].data
-    if kind == "lstm":
-        inputs = nn.functional.linear(x, weight_ih, bias_ih + bias_hh)
-        output = KernelLSTM.apply(inputs, weight_hh, *states, sizes)
-    else:
-        output = KernelGRU.apply(nn.functional.linear(x, weight_ih, bias_ih), weight_hh, bias_hh, *states, sizes)
-    check(
-        {"x": x, **{f"state {i}": state for i, state in enumerate(states)}, **dict(layer.named_parameters())},
-        output,
-        expected,
-    )
+    hidden = torch.randn(2 if kind is nn.LSTM else 1, 2, sizes[0], width)
+    expected, _ = layers(PackedSequence(x, torch.tensor(sizes)), hidden[0] if kind is nn.GRU else tuple(hidden))
+    output = packed_layers(x, layers.all_weights, hidden, sizes, native)
+    check({"x": x, **dict(layers.named_parameters())}, output, expected.data)
+
+
+@pytest.mark.parametrize("shape", batches(), ids=str)
+def test_min_gru_equals_its_equations(shape: tuple[int, list[int]]) -> None:
+    width, sizes = shape
+    torch.manual_seed(1)
+    hidden = torch.randn(sizes[0], width, requires_grad=True)
+    inputs = torch.randn(sum(sizes), 2 * width, requires_grad=True)
+    output, expected = KernelMinGRU.apply(inputs, hidden, sizes), min_gru(inputs, hidden, sizes)
+    check({"inputs": inputs, "hidden": hidden}, output, expected)
 
 
 def test_gradients_are_the_same_when_they_are_computed_twice() -> None:

@@ -1,14 +1,17 @@
-"""The memories: outputs equal plain references, and no information leaks from the future or from other episodes."""
+"""The memories: outputs equal plain references, and every weight gets a gradient. `conformance` checks that nothing leaks."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from agents_helpers import BRANCHES, ends, make, observations, play, settings, transformer
+from agents_helpers import BRANCHES, ends, loss_of, make, observations, play, segment_of, settings, transformer
 
-from endless_gym_agents.agent import Agent
+from endless_gym_agents.agent import Agent, AgentMemory
+from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.memory import balanced_split
 from endless_gym_agents.recurrent import RecurrentMemory, RecurrentMinibatch
+from endless_gym_agents.rollout import Segment
 from endless_gym_agents.settings import PRESETS, Recurrence
 from endless_gym_agents.transformer import Block, TransformerMemory
 
@@ -51,7 +54,6 @@ TRANSFORMERS = [name for name in KINDS if "trxl" in name]
 #: Those whose longest test is not slow.
 FAST = ["trxl", "trxl, relative", "trxl, single steps", "gtrxl, learned, previous"]
 OTHERS = [name for name in TRANSFORMERS if name not in FAST]
-WITH_STATE = [name for name in KINDS if name not in ("none", "position")]
 
 
 @pytest.fixture(autouse=True)
@@ -123,29 +125,54 @@ def test_rank_may_have_no_steps_in_a_minibatch(name: str) -> None:
     assert sorted(torch.cat(indices).tolist()) == list(range(STEPS))
 
 
-# Frame stacks are made in `act`; `forward` takes the stacked observations.
-@pytest.mark.parametrize("name", [name for name in WITH_STATE if KINDS[name][0] != "stack"])
-def test_forward_does_not_leak(name: str) -> None:
-    """The gradient of one step's value with respect to all observations is nonzero only up to that step, within its episode."""
-    agent, (kind, changes) = agent_of(name), KINDS[name]
-    memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
-    done[9, 1] = True
-    observed = observations(STEPS, ENVS)
-    reset_mask, *_ = play(agent, memory, observed, done)
-    (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
-    flat = observed.flatten(0, 1)[minibatch.indices].requires_grad_()
-    value = agent({"features": flat}, minibatch).value
-    (gradient,) = torch.autograd.grad(value[(minibatch.indices == 15 * ENVS + 1).nonzero().item()], flat)
-    reached = {(int(step) // ENVS, int(step) % ENVS) for step in minibatch.indices[gradient.abs().sum(-1) > 0]}
-    assert (15, 1) in reached
-    assert reached <= {(t, 1) for t in range(10, 16)}
-    if kind in ("trxl", "gtrxl"):
-        # Cached tokens have no gradient.
-        assert reached == {(15, 1)}
-    else:
-        # Truncated BPTT: back to the start of the episode or of the sequence.
-        length = changes.get("recurrence", settings(kind).recurrence).sequence_length
-        assert reached == {(t, 1) for t in range(max(10, 15 - 15 % length), 16)}
+# The observation of the agents `stack` and `position` is transformed in `act`, before the network.
+@pytest.mark.parametrize("name", [name for name in KINDS if name not in ("stack", "position")])
+def test_every_weight_gets_a_gradient(name: str) -> None:
+    """That weights change is not enough, since AdamW also decays weights without a gradient."""
+    agent = agent_of(name)
+    memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
+    # In the second segment, the hidden states of recurrent layers are no longer zero.
+    play(agent, memory, observed, ends(STEPS, ENVS))
+    segment = segment_of(agent, memory, {"features": observed}, STEPS, ENVS)
+    assert without_gradient(agent, segment, memory) == []
+
+
+@pytest.mark.parametrize("kind", ["gru", "trxl"])
+def test_every_weight_of_an_agent_with_all_heads_gets_a_gradient(kind: str) -> None:
+    ppo = {"reconstruction_coefficient": 0.1, "ground_truth_coefficient": 1.0}
+    given = settings(kind, ppo=ppo, environment={"observation": "rgb"})
+    torch.manual_seed(3)
+    agent = Agent(given, {FRAME: (84, 84, 3), "vector_observation": (5,)}, BRANCHES, ground_truth=2)
+    memory, draws = agent.initial_memory(ENVS), torch.Generator().manual_seed(4)
+    frames = torch.randint(0, 256, (STEPS, ENVS, 84, 84, 3), dtype=torch.uint8, generator=draws)
+    observation = {FRAME: frames, "vector_observation": torch.randn(STEPS, ENVS, 5, generator=draws)}
+    segment = segment_of(agent, memory, observation, STEPS, ENVS)
+    assert without_gradient(agent, segment, memory) == []
+
+
+def without_gradient(agent: Agent, segment: Segment, memory: AgentMemory) -> list[str]:
+    """Names of the weights whose gradient of the total loss is missing or entirely 0."""
+    loss_of(agent, segment, memory.state, agent.settings.ppo, 0.01).backward()
+    return [name for name, weight in agent.named_parameters() if weight.grad is None or not weight.grad.any()]
+
+
+@pytest.mark.parametrize("name", TRANSFORMERS)
+def test_gradients_are_the_same_for_each_sequence_length(name: str) -> None:
+    """Sequences of one step are computed by a different algorithm than longer ones."""
+    agent = agent_of(name)
+    memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
+    play(agent, memory, observed, ends(STEPS, ENVS))
+    reset_mask, *_ = play(agent, memory, observed, ends(STEPS, ENVS))
+    factor, gradients = torch.randn(STEPS * ENVS), []
+    for length in (1, 4, STEPS):
+        agent.memory.settings = replace(agent.memory.settings, sequence_length=length)
+        (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+        agent.zero_grad()
+        value = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch).value
+        (value * factor[minibatch.indices]).sum().backward()
+        gradients.append({key: weight.grad for key, weight in agent.named_parameters() if weight.grad is not None})
+    for other in gradients[1:]:
+        torch.testing.assert_close(other, gradients[0], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", FAST + [pytest.param(name, marks=pytest.mark.slow) for name in OTHERS])

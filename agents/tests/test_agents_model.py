@@ -1,7 +1,7 @@
 """The network: number of parameters, heads, settings and presets."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -42,34 +42,6 @@ PAPER = PRESETS["paper"]
 def test_number_of_parameters_is_as_computed_by_hand(agent: str, changes: dict, count: int) -> None:
     made = Agent(replace(PAPER, agent=agent, **changes), {"visual_observation": (84, 84, 3)}, (3, 3))
     assert made.num_parameters == count
-
-
-def test_preset_paper_equals_the_table_of_the_paper() -> None:
-    """Hyperparameters of the column `Final`."""
-    ppo, recurrence, trxl = PAPER.ppo, PAPER.recurrence, PAPER.transformer
-    assert PAPER.environment.num_envs == 32
-    assert ppo.steps == 512
-    assert ppo.steps * PAPER.environment.num_envs == 16_384
-    assert (ppo.gamma, ppo.gae_lambda, ppo.epochs, ppo.minibatches) == (0.995, 0.95, 3, 8)
-    assert ppo.advantage_normalisation == "none"
-    assert (ppo.clip_range, ppo.value_coefficient) == (0.1, 0.5)
-    assert (ppo.learning_rate, ppo.final_learning_rate) == (2.75e-4, 1.0e-5)
-    assert (ppo.entropy_coefficient, ppo.final_entropy_coefficient) == (1.0e-4, 1.0e-6)
-    assert ppo.max_gradient_norm == 0.25
-    assert ppo.decay_updates * 16_384 == 163_840_000
-    assert asdict(recurrence) == {
-        "hidden_size": 512,
-        "match_gru": False,
-        "layers": 1,
-        "residual": False,
-        "embedding": True,
-        "sequence_length": 512,
-        "kernels": "auto",
-    }
-    assert (trxl.layers, trxl.width, trxl.heads) == (3, 384, 4)
-    assert (trxl.initialisation, trxl.positional_encoding) == ("xavier", "absolute")
-    # The authors shuffle single steps.
-    assert trxl.sequence_length == 1
 
 
 @pytest.mark.parametrize(
@@ -113,33 +85,6 @@ def test_run_lengths_are_those_of_the_published_curves() -> None:
     fewer = changed(PAPER, environment={"num_envs": 8}).validated()
     assert fewer.ppo.updates == 4 * PAPER.validated().ppo.updates
     assert changed(PAPER, ppo={"updates": 7}).validated().ppo.updates == 7
-
-
-def test_preset_overnight_reaches_the_first_point_of_the_published_curves() -> None:
-    given = PRESETS["overnight"].validated()
-    steps = given.environment.num_envs * given.ppo.steps * given.ppo.updates
-    (curve,) = curves.published(given.env, ["gru"])
-    assert (given.env, given.environment.observation) == ("Endless-MortarMayhem-v0", "rgb")
-    assert steps == curve.steps[1] == 8_192_000
-    assert changed(given, preset="paper", ppo={"updates": PAPER.validated().ppo.updates}) == PAPER.validated()
-
-
-def test_preset_throughput_512_keeps_the_steps_of_the_paper() -> None:
-    given = PRESETS["throughput-512"].validated()
-    assert (given.environment.num_envs, given.ppo.steps, given.recurrence.sequence_length) == (128, 512, 512)
-    batch, paper = 128 * 512, 32 * 512
-    assert batch / given.ppo.minibatches == paper / PAPER.ppo.minibatches
-    assert batch * given.ppo.updates == paper * PAPER.validated().ppo.updates
-    assert batch * given.ppo.decay_updates == paper * PAPER.ppo.decay_updates
-    assert replace(given.transformer, sequence_length=1) == PAPER.transformer
-
-
-def test_preset_throughput_has_more_environments_and_equal_steps_per_update() -> None:
-    given = PRESETS["throughput"]
-    assert (given.environment.num_envs, given.ppo.steps) == (512, 32)
-    assert given.environment.num_envs * given.ppo.steps == PAPER.environment.num_envs * PAPER.ppo.steps
-    assert given.recurrence.sequence_length == given.transformer.sequence_length == given.ppo.steps
-    assert replace(given.ppo, steps=PAPER.ppo.steps) == PAPER.ppo
 
 
 @pytest.mark.parametrize("name", PRESETS)

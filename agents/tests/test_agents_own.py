@@ -60,27 +60,6 @@ def test_the_commands_of_the_page_work(
     assert checkpoint.load(file.parent / run).agent.memory.width == 128
 
 
-@pytest.mark.parametrize("embedding", [True, False])
-def test_forward_equals_the_rollout_with_the_same_weights(embedding: bool, file: Path) -> None:
-    given = settings(f"{file}:MinGRU", env="MortarMayhem-Grid-v0", agent_option=("layers=2",), threads=1)
-    environment = {"num_envs": 8, "groups": 2, "option": ("command_count=[1, 2]",)}
-    given = changed(given, environment=environment, ppo={"steps": 16, "minibatches": 2})
-    given = changed(given, recurrence={"embedding": embedding, "sequence_length": 5})
-    with collecting(given) as collector:
-        made = collector.agent
-        for _ in range(2):
-            segment, _ = collector.collect(Clock())
-            flat, states = segment.flat(), [memory.state for memory in collector.memories]
-            for minibatch in made.memory.minibatches(states, segment.reset_mask, 2, torch.Generator().manual_seed(1)):
-                output = made({key: part[minibatch.indices] for key, part in flat.observation.items()}, minibatch)
-                log_prob = output.log_prob(flat.action[minibatch.indices])
-                torch.testing.assert_close(log_prob, flat.log_prob[minibatch.indices], rtol=1e-5, atol=1e-5)
-                torch.testing.assert_close(output.value, flat.value[minibatch.indices], rtol=1e-5, atol=1e-5)
-            before = made.memory.cell.gates[1].weight.clone()
-            learn(made, make_optimizer(made, 0.01), segment, states, 0, given.ppo, torch.Generator().manual_seed(1))
-            assert not torch.equal(before, made.memory.cell.gates[1].weight)
-
-
 def test_acting_with_an_own_encoder_equals_learning_with_it(file: Path) -> None:
     given = settings("gru", env="MortarMayhem-Grid-v0", encoder=str(file.parent / "impala.py:Impala"), threads=1)
     given = changed(given, encoder_option=("channels=[2]",), ppo={"steps": 8, "minibatches": 2})
