@@ -10,9 +10,6 @@ import pytest
 from support import MEMORY_GYM
 
 import endless_gym
-from endless_gym.program import program
-
-SPECS = list(endless_gym.all_specs().values())
 
 
 @pytest.mark.parametrize("id", MEMORY_GYM)
@@ -44,23 +41,6 @@ def test_help_shows_actions_and_ground_truth(shown: object) -> None:
     assert "action: 0 nothing, 1 left, 2 right, 3 ahead" in page
     assert 'info["ground_truth"][0], target_x: column of the tile' in page
     assert all(id in page for id in MEMORY_GYM)
-
-
-@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
-def test_program_lists_actions_and_columns(spec) -> None:
-    listed = subprocess.run(
-        [*program(), "list", spec.id, "--picture", "never"], capture_output=True, text=True, check=True
-    )
-    for branch in spec.actions:
-        choices = ", ".join(f"{value} {choice.name}" for value, choice in enumerate(branch.choices))
-        assert f"{branch.name}: {choices}" in listed.stdout
-    words = listed.stdout.split()
-    assert {column.name for column in (*spec.ground_truth_columns, *spec.feature_columns)} <= set(words)
-    as_json = json.loads(
-        subprocess.run([*program(), "list", spec.id, "--json"], capture_output=True, text=True, check=True).stdout
-    )
-    assert [branch["name"] for branch in as_json["actions"]] == [branch.name for branch in spec.actions]
-    assert [tuple(each.values()) for each in as_json["ground_truth"]] == list(spec.ground_truth_columns)
 
 
 def test_a_package_without_docstrings_can_be_imported() -> None:

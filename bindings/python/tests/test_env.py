@@ -128,18 +128,6 @@ def test_wrong_arguments_and_calls_raise() -> None:
         endless_gym.Env("Mortar")
 
 
-def test_restored_snapshot_continues_identically() -> None:
-    env = endless_gym.Env("Endless-SearingSpotlights-v0")
-    env.reset(seed=4)
-    snapshot = env.snapshot()
-    rewards = [env.step([1, 2])[:3] for _ in range(50)]
-    env.restore(snapshot)
-    for wanted in rewards:
-        observation, reward, terminated, *_ = env.step([1, 2])
-        np.testing.assert_array_equal(observation, wanted[0])
-        assert (reward, terminated) == wanted[1:]
-
-
 def test_the_originals_ids_and_classes_make_equal_environments() -> None:
     import endless_gym.memory_gym as memory_gym
 

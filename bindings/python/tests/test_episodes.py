@@ -139,37 +139,6 @@ def test_wrong_options_change_nothing(where: Callable[..., Envs]) -> None:
         envs.recv(0)
 
 
-@pytest.mark.parametrize("where", WHERE)
-def test_options_survive_snapshots(where: Callable[..., Envs]) -> None:
-    with where(ID, 2, seed=0) as envs, endless_gym.make_vec(ID, 2, seed=5) as others:
-        envs.reset(options=TWO)
-        envs.set_options(ONE)
-        snapshot = envs.snapshot(0)
-        others.reset()
-        others.restore({1: snapshot})
-        assert played(others) == [{}, TWO]
-        until_all_began(others)
-        assert played(others) == [{}, ONE]
-        # The restored options last until the next reset.
-        others.reset()
-        assert played(others) == [{}, {}]
-
-
-def test_options_survive_checkpoints(tmp_path) -> None:
-    arguments: dict[str, Any] = {"num_envs": 2, "seed": 0, "checkpoint": tmp_path / "saved"}
-    with endless_gym.serve(ID, **arguments) as envs:
-        envs.reset(options=TWO)
-        envs.set_options(ONE, mask=np.array([True, False]))
-    with endless_gym.serve(ID, resume=True, **arguments) as envs:
-        envs.adopt()
-        assert played(envs) == [TWO, TWO]
-        until_all_began(envs)
-        assert played(envs) == [ONE, TWO]
-        # The new trainer knows only the options given at creation.
-        envs.reset()
-        assert played(envs) == [{}, {}]
-
-
 class Choices:
     """Chooses one, two, three or the default number of commands in turn, and records its calls."""
 

@@ -144,20 +144,6 @@ def test_groups_are_stepped_independently(where) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_seeds_count_the_environments_of_all_groups(where) -> None:
-    with where(ID, 2, groups=2) as envs, endless_gym.make_vec(ID, 4) as all_envs:
-        whole, _ = all_envs.reset(seed=7)
-        assert (whole[:2] != whole[2:]).any()
-        for group in range(2):
-            envs.send_reset(group, seed=7)
-            np.testing.assert_array_equal(envs.recv(group)[0], whole[2 * group : 2 * group + 2])
-        np.testing.assert_array_equal(envs.reset(seed=7)[0], whole[:2])
-        np.testing.assert_array_equal(envs.reset(seed=7, group=1)[0], whole[2:])
-        everything = {"reset_mask": np.ones(2, dtype=bool)}
-        np.testing.assert_array_equal(envs.reset(seed=7, group=1, options=everything)[0], whole[2:])
-
-
-@pytest.mark.parametrize("where", WHERE)
 def test_reset_takes_options_and_a_mask(where) -> None:
     with where("MortarMayhem-v0", 3, autoreset="disabled") as envs:
         usual, _ = envs.reset(seed=1)
@@ -171,28 +157,6 @@ def test_reset_takes_options_and_a_mask(where) -> None:
         np.testing.assert_array_equal(mixed[0], envs.reset(seed=7)[0][0])
         with pytest.raises(ValueError, match="reset_mask"):
             envs.reset(options={"reset_mask": [1, 0]})
-
-
-@pytest.mark.parametrize("where", WHERE)
-def test_each_environment_can_have_its_own_options(where) -> None:
-    each = [{"arena_size": size} for size in (2, 3, 4, 5)]
-    with where("MortarMayhem-v0", 2, groups=2, seed=1, options=each) as envs:
-        for group in range(2):
-            observation, _ = envs.reset(group=group)
-            for env in range(2):
-                number = 2 * group + env
-                alone = endless_gym.Env("MortarMayhem-v0", options=each[number])
-                np.testing.assert_array_equal(observation[env], alone.reset(seed=1 + number)[0])
-
-
-def test_features_are_observed_with_or_without_frames() -> None:
-    envs = endless_gym.make_vec(ID, 2, seed=1, observation="features")
-    observation, _ = envs.reset()
-    assert observation.dtype == np.float32
-    assert envs.observation_space.contains(observation)
-    both, _ = endless_gym.make_vec(ID, 2, seed=1, observation="rgb+features").reset()
-    np.testing.assert_array_equal(both["features"], observation)
-    assert both["visual_observation"].shape == (2, 84, 84, 3)
 
 
 def test_gymnasiums_make_vec_returns_this_class() -> None:
