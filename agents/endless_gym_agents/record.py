@@ -9,58 +9,21 @@ endless-record runs/mine --episodes 1000 --error-rates 0 0.1
 from __future__ import annotations
 
 import sys
+from argparse import Namespace
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 
 from endless_gym.recording import command as recording
-from endless_gym.recording import record
 from endless_gym.recording.players import Actor
 from endless_gym.specs import ObservationName, spec
-from endless_gym_agents import checkpoint, command, ranges
+from endless_gym_agents import checkpoint, command
 from endless_gym_agents.agent import Agent
-from endless_gym_agents.ranges import Natural, Positive, Range
 from endless_gym_agents.train import choose_device
-
-
-@dataclass(frozen=True)
-class RecordArguments:
-    """Arguments of `endless-record`."""
-
-    checkpoint: tyro.conf.Positional[Path]
-    """a checkpoint file, or the folder of a run for its last checkpoint"""
-    episodes: Positive = 1000
-    """number of episodes"""
-    error_rates: Annotated[tuple[float, ...], Range(0, 1)] = (0.0,)
-    """probability that a step takes a random action instead of the agent's; episodes cycle through several values"""
-    seed: Natural = 0
-    """episode i has the seed SEED + i"""
-    action_seed: Natural = 0
-    """seed of the action sampling and of the random actions"""
-    greedy: bool = False
-    """take the most likely actions instead of sampling"""
-    max_steps: Annotated[int | None, Range(1)] = None
-    """truncate episodes after this number of steps; by default after 1000 in environments without a step limit"""
-    name: str | None = None
-    """id of the data set; by default endless-gym/ID/agent-v0"""
-    root: Path | None = None
-    """folder of the data sets; by default MINARI_DATASETS_PATH, or ~/.minari/datasets"""
-    overwrite: bool = False
-    """replace an existing data set with that id"""
-    author: str | None = None
-    """author in the metadata"""
-    threads: Natural = 0
-    """threads that play; 0 for one per core"""
-    json: bool = False
-    """print JSON instead of text"""
-    device: str = "cpu"
-    """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
 
 
 class AgentPlayer:
@@ -97,41 +60,29 @@ class AgentPlayer:
         return act
 
 
-def execute(arguments: RecordArguments) -> None:
+def execute(given: Namespace) -> None:
     """Record the episodes, and print what was recorded."""
-    ranges.check(arguments)
-    agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
+    agent = checkpoint.load(given.checkpoint, choose_device(given.device)).agent
     settings = agent.settings
     if settings.environment.wrapper:
         raise ValueError(
             "a data set contains the environment's own observations and rewards; got an agent that was trained with "
             f"--environment.wrapper {' '.join(settings.environment.wrapper)}"
         )
-    with recording.progress(arguments.episodes) as bar:
-        recorded = record(
-            settings.env,
-            arguments.episodes,
-            policy=AgentPlayer(agent, arguments.action_seed, arguments.greedy),
-            error_rates=arguments.error_rates,
-            seed=arguments.seed,
-            action_seed=arguments.action_seed,
-            options=settings.options(),
-            max_steps=arguments.max_steps,
-            observation=settings.environment.observation,
-            dataset=arguments.name,
-            root=arguments.root,
-            overwrite=arguments.overwrite,
-            author=arguments.author,
-            num_threads=arguments.threads,
-            progress=bar,
-        )
-    recording.show(recorded, arguments.json)
+    player = AgentPlayer(agent, given.action_seed, given.greedy)
+    options = settings.options()
+    recording.write(given, settings.env, policy=player, options=options, observation=player.observation)
 
 
 def main() -> int:
     """Entry point of the command `endless-record`; returns the exit status."""
-    arguments = command.parse(RecordArguments, "endless-record", __doc__)
-    return recording.run("endless-record", lambda: execute(arguments))
+    parser = recording.parser("endless-record", command.description(__doc__), "endless-gym/ID/agent-v0")
+    add = parser.add_argument
+    add("checkpoint", type=Path, help="a checkpoint file, or the folder of a run for its last checkpoint")
+    add("--greedy", action="store_true", help="take the most likely actions instead of sampling")
+    add("--device", default="cpu", help="`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available [default: cpu]")
+    given = parser.parse_args()
+    return recording.run("endless-record", lambda: execute(given))
 
 
 if __name__ == "__main__":

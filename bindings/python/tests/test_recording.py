@@ -356,4 +356,4 @@ def test_the_values_of_a_repeated_flag_accumulate() -> None:
         "b=2",
     ]
     given = _parser().parse_args(repeated)
-    assert (given.error_rate, given.option) == ([0.0, 0.1, 0.2], ["a=1", "b=2"])
+    assert (given.error_rates, given.option) == ([0.0, 0.1, 0.2], ["a=1", "b=2"])

@@ -90,30 +90,39 @@ def progress(episodes: int) -> Iterator[Callable[[int], None]]:
         yield lambda done: bar.update(task, completed=done)
 
 
-def _execute(given: argparse.Namespace) -> None:
-    if given.options and given.option:
-        raise ValueError("--option and --options cannot be given together")
-    format = Frames(given.grayscale, given.channels_first, given.row_major, given.frame_stack)
+def write(given: argparse.Namespace, id: str, **arguments: Any) -> None:
+    """Record as the arguments of `parser` say, with further ones of `record`, and print what was recorded."""
     with progress(given.episodes) as bar:
         recording = record(
-            given.id,
+            id,
             given.episodes,
-            policy=given.policy,
-            error_rates=given.error_rate or [0.0],
+            error_rates=given.error_rates or [0.0],
             seed=given.seed,
             action_seed=given.action_seed,
-            options=[_object(text) for text in given.options] or _parameters(given.option),
             max_steps=given.max_steps,
-            observation=given.observation,
-            frames=None if format == Frames() else format,
             dataset=given.name,
             root=given.root,
             overwrite=given.overwrite,
             author=given.author,
             num_threads=given.threads,
             progress=bar,
+            **arguments,
         )
     show(recording, given.json)
+
+
+def _execute(given: argparse.Namespace) -> None:
+    if given.options and given.option:
+        raise ValueError("--option and --options cannot be given together")
+    format = Frames(given.grayscale, given.channels_first, given.row_major, given.frame_stack)
+    write(
+        given,
+        given.id,
+        policy=given.policy,
+        options=[_object(text) for text in given.options] or _parameters(given.option),
+        observation=given.observation,
+        frames=None if format == Frames() else format,
+    )
 
 
 def _parameters(given: Sequence[str]) -> dict[str, Any]:
@@ -141,23 +150,54 @@ def _object(text: str) -> dict[str, Any]:
     return options
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="endless record", description=__doc__.partition(": ")[2], allow_abbrev=False)
+def parser(name: str, description: str, default: str) -> argparse.ArgumentParser:
+    """A parser with the arguments of every command that records; `default` is the data set's default id."""
+    parser = argparse.ArgumentParser(prog=name, description=description, allow_abbrev=False)
     add = parser.add_argument
-    add("id", metavar="ID", help="environment id; `endless list` lists them")
-    add("--film", metavar="FILE", help="write a film instead; `endless record --film FILE --help` lists its options")
     add("--episodes", type=int, default=1000, metavar="N", help="number of episodes [default: 1000]")
-    add("--policy", choices=("expert", "random"), default="expert", help="who plays [default: expert]")
     add(
         "--error-rate",
+        "--error-rates",
+        dest="error_rates",
         type=float,
         nargs="+",
         action="extend",
         metavar="P",
-        help="probability that a step takes a random action instead of the expert's; episodes cycle through several [default: 0]",
+        help="probability that a step takes a random action instead of the policy's; episodes cycle through several [default: 0]",
     )
     add("--seed", type=int, default=0, help="episode i has the seed SEED + i [default: 0]")
-    add("--action-seed", type=int, default=0, metavar="SEED", help="seed of the random actions [default: 0]")
+    add(
+        "--action-seed",
+        type=int,
+        default=0,
+        metavar="SEED",
+        help="seed of an agent's and of random actions [default: 0]",
+    )
+    add(
+        "--max-steps",
+        type=int,
+        metavar="N",
+        help="truncate episodes after N steps [default: 1000 in environments without a step limit]",
+    )
+    add("--name", metavar="DATASET", help=f"id of the data set [default: {default}]")
+    add(
+        "--root",
+        metavar="FOLDER",
+        help="folder of the data sets [default: MINARI_DATASETS_PATH, or ~/.minari/datasets]",
+    )
+    add("--overwrite", action="store_true", help="replace a data set of that id")
+    add("--author", metavar="NAME", help="author in the metadata [default: none]")
+    add("--threads", type=int, default=0, metavar="N", help="threads that play; 0 for one per core [default: 0]")
+    add("--json", action="store_true", help="print JSON [default: text]")
+    return parser
+
+
+def _parser() -> argparse.ArgumentParser:
+    made = parser("endless record", __doc__.partition(": ")[2], "endless-gym/ID/expert-v0, or random-v0")
+    add = made.add_argument
+    add("id", metavar="ID", help="environment id; `endless list` lists them")
+    add("--film", metavar="FILE", help="write a film instead; `endless record --film FILE --help` lists its options")
+    add("--policy", choices=("expert", "random"), default="expert", help="who plays [default: expert]")
     add(
         "--option",
         action="append",
@@ -172,25 +212,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="JSON",
         help="reset parameters as a JSON object; if repeated, episodes cycle through them",
     )
-    add(
-        "--max-steps",
-        type=int,
-        metavar="N",
-        help="truncate episodes after N steps [default: 1000 in environments without a step limit]",
-    )
     add("--observation", default="rgb", metavar="KIND", help="rgb, features or rgb+features [default: rgb]")
     add("--grayscale", action="store_true", help="frames without colours")
     add("--channels-first", action="store_true", help="frames with the channel as the first axis")
     add("--row-major", action="store_true", help="frames indexed [row][column] [default: [x][y]]")
     add("--frame-stack", type=int, default=1, metavar="N", help="stack the last N frames [default: 1]")
-    add("--name", metavar="DATASET", help="id of the data set [default: endless-gym/ID/expert-v0, or random-v0]")
-    add(
-        "--root",
-        metavar="FOLDER",
-        help="folder of the data sets [default: MINARI_DATASETS_PATH, or ~/.minari/datasets]",
-    )
-    add("--overwrite", action="store_true", help="replace a data set of that id")
-    add("--author", metavar="NAME", help="author in the metadata [default: none]")
-    add("--threads", type=int, default=0, metavar="N", help="threads that play; 0 for one per core [default: 0]")
-    add("--json", action="store_true", help="print JSON [default: text]")
-    return parser
+    return made
