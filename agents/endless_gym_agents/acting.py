@@ -10,30 +10,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
 
 from endless_gym_agents.heads import PolicyHead, ValueHead
+from endless_gym_agents.memories.layers import Affine, linear_relu, transposed
 
-#: Bias (outputs,) and transposed weight (inputs, outputs) of a linear layer.
-Affine: TypeAlias = tuple[Tensor, Tensor]
 #: Logit that pads branches with fewer choices than the largest. Finite, since infinity gives NaN.
 NO_CHOICE = -1e9
 
 _version = attrgetter("_version")
-
-
-def transposed(layer: nn.Module, dtype: torch.dtype) -> Affine:
-    """Bias and transposed weight of a layer; the weight is contiguous, which a product with few rows needs to be fast."""
-    assert isinstance(layer, nn.Linear)
-    return layer.bias.detach().to(dtype), layer.weight.detach().t().to(dtype).contiguous()
-
-
-def linear_relu(x: Tensor, layer: Affine) -> Tensor:
-    """A linear layer followed by a ReLU, float (n, outputs), for inputs float (n, inputs)."""
-    return torch.addmm(layer[0], x, layer[1]).relu_()
 
 
 def weights_version(parameters: Sequence[Tensor]) -> int:

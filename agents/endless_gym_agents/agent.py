@@ -37,9 +37,10 @@ from torch import Tensor, nn
 from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
 from endless_gym_agents import own, wrappers
-from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
-from endless_gym_agents.encoders import FRAME, Encoder, Observation, OwnEncoder, Shapes, orthogonal
+from endless_gym_agents.acting import ActingWeights, acting_weights, weights_version
+from endless_gym_agents.encoders import FRAME, Encoder, Observation, OwnEncoder, Shapes
 from endless_gym_agents.heads import Perceptron, PolicyHead, ReconstructionHead, ValueHead
+from endless_gym_agents.memories.layers import linear_relu, orthogonal
 from endless_gym_agents.memories.sequence_model import SequenceModel
 from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
 from endless_gym_agents.recurrent import CellMemory, RecurrentMemory, SequenceMemory

@@ -6,13 +6,14 @@ An observation is a dict of tensors with the keys of the observation space: `vis
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from endless_gym_agents.memories.layers import orthogonal
 
 #: An observation of n environments, by key.
 Observation = dict[str, Tensor]
@@ -21,15 +22,6 @@ Shapes = Mapping[str, tuple[int, ...]]
 
 #: Key of the frames in an observation.
 FRAME = "visual_observation"
-
-Layer = TypeVar("Layer", nn.Linear, nn.Conv2d, nn.ConvTranspose2d)
-
-
-def orthogonal(layer: Layer, gain: float = math.sqrt(2)) -> Layer:
-    """Initialise the layer's weights with a scaled orthogonal matrix, in place, and return the layer."""
-    nn.init.orthogonal_(layer.weight, gain)
-    return layer
-
 
 #: Frames per chunk on the CPU. The activations between a chunk's layers then stay in the CPU's cache, which saves a quarter of
 #: the time.

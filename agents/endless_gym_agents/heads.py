@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from endless_gym_agents.encoders import orthogonal
+from endless_gym_agents.memories.layers import orthogonal
 
 
 class PolicyHead(nn.Module):

@@ -1,4 +1,4 @@
-"""Classes of your own in a module or a file, named by `--agent`, `--encoder` and `--environment.wrapper`."""
+"""Classes in a module or a file, of the package or your own, named by `--agent`, `--encoder` and `--environment.wrapper`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,18 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+#: The class of each memory, as `module:Class`, by the name that `--agent` takes.
+MEMORIES = {
+    "mingru": "endless_gym_agents.memories.mingru:MinGRU",
+    "lru": "endless_gym_agents.memories.lru:LRU",
+    "mamba2": "endless_gym_agents.memories.mamba2:Mamba2",
+    "gated-deltanet": "endless_gym_agents.memories.gated_deltanet:GatedDeltaNet",
+    "retnet": "endless_gym_agents.memories.retnet:RetNet",
+    "mlstm": "endless_gym_agents.memories.mlstm:MLSTM",
+    "ffm": "endless_gym_agents.memories.ffm:FFM",
+    "shm": "endless_gym_agents.memories.shm:SHM",
+}
 
 
 def resolved(name: str) -> str:

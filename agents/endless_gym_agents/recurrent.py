@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
-from endless_gym_agents.encoders import orthogonal
 from endless_gym_agents.kernels import kernels_are_faster
+from endless_gym_agents.memories.layers import orthogonal
 from endless_gym_agents.memories.sequence_model import SequenceModel, Stack, State, restarted
 from endless_gym_agents.memory import Memory, MemoryState, Minibatch, Minibatches, is_own, shuffled
 from endless_gym_agents.recurrence import packed_layers

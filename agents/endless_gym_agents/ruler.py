@@ -23,7 +23,6 @@ from endless_gym.create import make_vec
 from endless_gym.experts import Experts
 from endless_gym.specs import spec
 from endless_gym_agents import command
-from endless_gym_agents.experiments.definitions import Value
 from endless_gym_agents.settings import Environment, Settings
 
 #: What a task measures: which of several things was seen; where something is; in which order things were seen; how many.
@@ -61,10 +60,10 @@ class Task:
     longer: tuple[str, tuple[str, ...]] | None = None
     observable: str = ""
 
-    def flags(self) -> dict[str, Value]:
+    def flags(self) -> dict[str, Any]:
         """Flags of `endless-train` for this task, without `env`."""
-        chosen: dict[str, Value] = {"environment.option": list(self.options)} if self.options else {}
-        popgym: dict[str, Value] = {"environment.wrapper": [VECTORS], "environment.observation": "features"}
+        chosen: dict[str, Any] = {"environment.option": list(self.options)} if self.options else {}
+        popgym: dict[str, Any] = {"environment.wrapper": [VECTORS], "environment.observation": "features"}
         return chosen | (popgym if self.env.startswith("popgym") else {})
 
     def passes_gate(self, memoryless: float) -> bool:

@@ -18,8 +18,8 @@ from torch import nn
 
 from endless_gym.specs import DEFAULT_ENV_ID, spec
 from endless_gym_agents import own, ranges
-from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.metrics import is_finite
+from endless_gym_agents.own import MEMORIES
 from endless_gym_agents.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
 
 #: The agents of the package. Others are classes of your own; see `Settings.agent`.

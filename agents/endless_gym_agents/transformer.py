@@ -41,8 +41,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from endless_gym_agents.acting import Affine, linear_relu, transposed
-from endless_gym_agents.encoders import orthogonal
+from endless_gym_agents.memories.layers import Affine, linear_relu, orthogonal, transposed
 from endless_gym_agents.memory import Memory, MemoryState, Minibatch, Minibatches, is_own, shuffled
 from endless_gym_agents.settings import Transformer
 from endless_gym_agents.transformer_cache import Projection, RingCache, ring_ages
