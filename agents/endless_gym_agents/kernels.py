@@ -19,7 +19,7 @@ from endless_gym import _native
 
 
 def kernels_are_faster(width: int) -> bool:
-    """Whether the kernels are faster than PyTorch's operations for a hidden size, as measured by `benches/kernels.py`.
+    """Whether the kernels are faster than PyTorch's operations for a hidden size.
 
     The kernels use one thread. With two, PyTorch was slower up to 128 units; more were not measured.
     """
