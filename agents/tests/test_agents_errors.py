@@ -7,10 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from agents_helpers import saved, settings
 
 from endless_gym_agents import enjoy, plot, probe, protocol, record, reproduce, search, train
-from endless_gym_agents.settings import to_dict
 
 GRID = "--env MortarMayhem-Grid-v0"
 NO_RAY = "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"
@@ -168,22 +166,3 @@ def test_an_unknown_flag_suggests_the_nearest(
     error = capsys.readouterr().err
     assert re.search(rf"Unrecognized options: {given.split()[0]}\b", error), error
     assert re.search(rf"Perhaps you meant:.*{meant}\b", error, re.DOTALL), error
-
-
-@pytest.mark.parametrize(
-    ("flag", "message"),
-    [
-        ("--environment.num-envs 3", "must keep its environment.num-envs: expected 4, got 3; omit the flag"),
-        ("--recurrence.hidden-size 8", "must keep its recurrence.hidden-size: expected 16, got 8; omit the flag"),
-        ("--agent lstm", "must keep its agent: expected gru, got lstm; omit the flag"),
-    ],
-)
-def test_a_resumed_run_names_the_flag_that_differs(
-    flag: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = settings("gru", env="MortarMayhem-Grid-v0", threads=1, environment={"num_envs": 4}).validated()
-    saved(tmp_path, given)
-    (tmp_path / "settings.json").write_text(json.dumps(to_dict(given)))
-    monkeypatch.setattr(sys, "argv", ["endless-train", "--resume", str(tmp_path), *flag.split()])
-    assert train.main() == 1
-    assert message in capsys.readouterr().err

@@ -7,7 +7,6 @@ import signal
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -212,18 +211,9 @@ def test_signals_end_a_run_with_a_checkpoint_and_a_killed_one_resumes(tmp_path: 
     assert f"{updates} of 1 updates done" in learn(f"--resume {run} --ppo.updates 1")
 
 
-def test_a_run_killed_at_any_moment_or_with_a_full_disk_keeps_a_whole_checkpoint(tmp_path: Path) -> None:
-    run, draws, last = tmp_path / "run", np.random.default_rng(35), 0
-    for _ in range(5):
-        with training(run) as process:
-            # Each update saves, which takes most of its time.
-            time.sleep(draws.uniform(0, 0.1))
-            process.kill()
-        saved = checkpoint.load(run).update
-        assert saved >= last
-        last = saved
+def test_a_full_disk_leaves_the_former_checkpoint(tmp_path: Path) -> None:
     # With few rows, so that with the last limit the checkpoint is what cannot be written.
-    run, last = new_run(tmp_path / "other", "--ppo.updates 1 --no-keep-checkpoints"), 1
+    run, last = new_run(tmp_path / "run", "--ppo.updates 1 --no-keep-checkpoints"), 1
     file = run / "checkpoints" / "last.safetensors"
     former = file.read_bytes()
     for limit in (0, 1, len(former) // 2):

@@ -25,15 +25,6 @@ def test_every_number_has_a_name_and_a_meaning(id: str) -> None:
             json.dumps([metadata[name] for name in ("actions", "ground_truth", "features")])
 
 
-def test_names_describe_what_the_original_does() -> None:
-    grid = endless_gym.Env("MortarMayhem-Grid-v0").metadata["actions"]
-    assert grid == {"move": ["nothing", "left", "right", "ahead"]}
-    free = endless_gym.Env("Endless-MortarMayhem-v0").metadata
-    assert free["actions"] == {"horizontal": ["nothing", "left", "right"], "vertical": ["nothing", "up", "down"]}
-    assert list(free["ground_truth"]) == ["target_x", "target_y"]
-    assert endless_gym.Env("Endless-MysteryPath-v0").metadata["actions"] == {"move": ["nothing", "right", "up", "down"]}
-
-
 @pytest.mark.parametrize("shown", [endless_gym.Env, endless_gym.Env(MEMORY_GYM[0]), endless_gym.EndlessVectorEnv])
 def test_help_shows_actions_and_ground_truth(shown: object) -> None:
     page = pydoc.plain(pydoc.render_doc(shown))
