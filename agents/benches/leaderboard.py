@@ -287,7 +287,7 @@ def main() -> None:
     }
     torch.set_num_threads(1)
     done: dict[str, list[tuple[float, Job]]] = {}
-    for job in planning.jobs(definitions.load(str(file)), args.out, planning.read_scale(args.scale), seeds):
+    for job in planning.jobs_of(definitions.load(str(file)), args.out, planning.read_scale(args.scale), seeds):
         if job.state() == "done":
             task, agent, size = named[job.run.name]
             found = row(job, TASKS[task], Path(agent).name, size)

@@ -5,8 +5,8 @@ Training, from top to bottom: `train` is the training loop and `settings` its co
 `encoders`, a memory (`memory`, `recurrent`, `transformer`) and `heads`; `checkpoint` saves and loads.
 
 Evaluation: `protocol` is `endless-eval`, with `evaluate`, `metrics`, `statistics` and `results`; `plot` with `curves` is
-`endless-plot`; `enjoy` with `video` is `endless-enjoy`; `search` with `search_space` is `endless-search`;
-`reproduce` with `experiments` is `endless-reproduce`; `probe` is `endless-probe`.
+`endless-plot`; `enjoy` with `video` is `endless-enjoy`; `search` with `search_space` and `search_study` is `endless-search`;
+`reproduce` with `experiments` is `endless-reproduce`; `jobs`, with `jobs_ray`, runs their processes; `probe` is `endless-probe`.
 """
 
 from endless_gym_agents.agent import ActOutput, Agent, AgentMemory, AgentOutput, make_agent

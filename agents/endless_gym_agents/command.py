@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib.util
 import os
 import select
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -95,7 +96,7 @@ def run(name: str, work: Callable[[], object]) -> int:
         print(f"{name}: stopped", file=sys.stderr)
         return INTERRUPTED
     except ModuleNotFoundError as error:
-        print(f"{name}: {printable(error.name)} is not installed", file=sys.stderr)
+        print(f"{name}: {printable(error.msg)}", file=sys.stderr)
         return 1
     except (ValueError, OSError) as error:
         print(f"{name}: {printable(' '.join(str(error).split()))}", file=sys.stderr)
@@ -126,6 +127,32 @@ def parse(
     given = joined(_repeatable(arguments), sys.argv[1:] if given is None else given)
     known = tyro.MISSING_NONPROP if default is None else default
     return tyro.cli(arguments, prog=name, description=description(text), args=given, default=known)
+
+
+def flags(values: Mapping[str, Any]) -> list[str]:
+    """Command-line arguments for flags, without dashes, and their values; a list is several values."""
+    arguments: list[str] = []
+    for name, value in values.items():
+        if isinstance(value, bool):
+            group, dot, entry = name.rpartition(".")
+            arguments.append(f"--{name}" if value else f"--{group}{dot}no-{entry}")
+        else:
+            arguments += [f"--{name}", *(map(str, value) if isinstance(value, list) else [str(value)])]
+    return arguments
+
+
+def check_installed(user: str, package: str, extra: str = "train") -> None:
+    """Check that a package of an extra of this package is installed.
+
+    Raises:
+        ModuleNotFoundError: It is not; the message names its user and the extra.
+    """
+    if importlib.util.find_spec(package) is None:
+        raise ModuleNotFoundError(
+            f"{user} needs {package}, which is not installed: pip install './agents[{extra}]', or the wheel file with "
+            f"`[{extra}]` appended",
+            name=package,
+        )
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:

@@ -13,22 +13,21 @@ endless-reproduce endless --ray auto           # on the machines of a Ray cluste
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sys
-from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import Console
 from rich.table import Table
 
 from endless_gym.printable import printable
-from endless_gym_agents import command, ray_session, tables
+from endless_gym_agents import checkpoint, command, jobs, jobs_ray, tables
 from endless_gym_agents.clock import duration
-from endless_gym_agents.experiments import definitions, planning, running, running_ray
+from endless_gym_agents.experiments import definitions, planning
 from endless_gym_agents.experiments.definitions import Experiment
 from endless_gym_agents.experiments.planning import Job
 from endless_gym_agents.ranges import Natural, Positive, Range
@@ -88,13 +87,25 @@ def listed(experiments: list[Experiment], scale: float) -> Table:
     return table
 
 
-def machine_of(arguments: ReproduceArguments) -> running.Machine:
-    """The resources for the runs; with `--ray`, the number of jobs is that of this machine until Ray is connected."""
-    if not arguments.ray:
-        return running.machine(arguments.jobs, arguments.device, arguments.nice)
-    here = running.machine(arguments.jobs, "cpu", arguments.nice)
-    # Ray assigns GPUs to each run.
-    return replace(here, device=arguments.device, gpus=(), job_cores=arguments.job_cpus)
+def show_status(planned: list[Job], console: Console) -> None:
+    """Print a line about each job."""
+    seconds = planning.seconds_left(planned)
+    for number, job in enumerate(planned):
+        state, trained = job.state(), min(job.updates_done(), job.updates)
+        of = f", update {trained} of {job.updates}" if job.updates else ""
+        if job.experiment.kind == "curves" and state != "done" and trained == job.updates:
+            of += ", evaluation left"
+        elif trained < job.updates and seconds is not None:
+            of += f", {duration(seconds[number])} left"
+            of += "" if planning.update_seconds(job) else ", estimated from other runs"
+        console.print(f"{state:<11}  {job.title}{of}")
+
+
+def remove_checkpoints(job: Job) -> None:
+    """Remove the checkpoints of an evaluated run, except the last."""
+    if job.experiment.kind == "curves":
+        for file in (job.folder / checkpoint.FOLDER).glob("update-*.pt"):
+            file.unlink()
 
 
 def execute(arguments: ReproduceArguments) -> None:
@@ -115,61 +126,58 @@ def execute(arguments: ReproduceArguments) -> None:
         else:
             tables.show(listed(experiments, scale), console)
         return
-    machine, out = machine_of(arguments), arguments.out
+    # Ray assigns cores and GPUs to each run; how many run at the same time is known once it is connected.
+    machine = jobs.machine(arguments.jobs, "cpu" if arguments.ray else arguments.device, arguments.nice)
+    machine = replace(machine, device=arguments.device, job_cores=arguments.job_cpus if arguments.ray else 0)
     if arguments.ray:
-        ray_session.check_installed()
-        out = out.resolve()  # Ray's processes have other working directories.
-    parts = {one.name: planning.jobs(one, out, scale, arguments.seeds) for one in experiments}
+        command.check_installed("--ray", "ray", "ray")
+    out = arguments.out.resolve() if arguments.ray else arguments.out  # Ray's processes have other working directories.
+    parts = {one.name: planning.jobs_of(one, out, scale, arguments.seeds) for one in experiments}
     # Runs shared by several experiments are run once.
-    planned = list({job.folder: job for jobs in parts.values() for job in jobs}.values())
+    planned = list({job.folder: job for own in parts.values() for job in own}.values())
     planning.check_folders(planned)
+    left = [job for job in planned if job.state() != "done"]
     if arguments.dry_run:
-        for number, job in enumerate(job for job in planned if job.state() != "done"):
-            for line in planning.commands(job, machine.device, machine.engine_threads):
-                print(printable(running.shown(line, machine, number)))
+        for number, job in enumerate(left):
+            for line in job.commands(machine):
+                print(printable(jobs.shown(line, machine, number)))
         return
     if arguments.status:
-        seconds = planning.seconds_left(planned)
-        for number, job in enumerate(planned):
-            state, trained = job.state(), min(job.updates_done(), job.updates)
-            of = f", update {trained} of {job.updates}" if job.updates else ""
-            if job.experiment.kind == "curves" and state != "done" and trained == job.updates:
-                of += ", evaluation left"
-            elif trained < job.updates and seconds is not None:
-                of += f", {duration(seconds[number])} left"
-                of += "" if planning.update_seconds(job) else ", estimated from other runs"
-            console.print(f"{state:<11}  {job.title}{of}", soft_wrap=True)
+        show_status(planned, console)
     side_by_side = "on Ray" if arguments.ray else f"{machine.jobs} at a time"
-    console.print(f"{running.left(planned, machine.jobs)}, {side_by_side}", soft_wrap=True)
+    console.print(f"{planning.summary(planned, machine.jobs)}, {side_by_side}")
     if arguments.status:
         return
-    failed: list[Job] = []
-    if not arguments.report:
-        with contextlib.ExitStack() as stack:
-            make: Callable[..., running.Runner] = running.Runner
-            if arguments.ray and any(job.state() != "done" for job in planned):
-                stack.enter_context(ray_session.connected(arguments.ray))
-                gpus = ray_session.gpus(arguments.job_gpus, arguments.device)
-                machine = replace(machine, jobs=arguments.jobs or running_ray.jobs_that_fit(arguments.job_cpus, gpus))
-                make = partial(running_ray.RayRunner, gpus=gpus)
+    for package in ("tensorboard", "matplotlib"):
+        command.check_installed("endless-reproduce", package)
+    folder, failed = planning.folder_of(out, scale), []
+    if left and not arguments.report:
+        given = (arguments.device, arguments.nice, arguments.job_cpus, arguments.job_gpus)
+        connection = (
+            jobs_ray.connected(arguments.ray, arguments.jobs, *given) if arguments.ray else nullcontext(machine)
+        )
+        with connection as machine:
             # Speeds are measured one at a time.
-            alone = [job for job in planned if job.experiment.kind == "simulation-speed"]
-            others = [job for job in planned if job not in alone]
-            for jobs, on in ((others, machine), (alone, replace(machine, jobs=1))):
-                runner = make(on, partial(console.print, soft_wrap=True), arguments.keep_checkpoints)
-                runner.run(jobs)
+            alone = [job for job in left if job.experiment.kind == "simulation-speed"]
+            others = [job for job in left if job not in alone]
+            for some, on in ((others, machine), (alone, replace(machine, jobs=1))):
+                runner = jobs.Runner(
+                    on,
+                    folder / jobs.LIST,
+                    console.print,
+                    lambda: planning.summary(planned, machine.jobs),
+                    (lambda job: None) if arguments.keep_checkpoints else remove_checkpoints,
+                )
+                runner.run(some)
                 failed += runner.failed
                 if runner.stopped:
-                    console.print(
-                        f"{running.left(planned, machine.jobs)}; repeat the command to continue", soft_wrap=True
-                    )
+                    console.print(f"{planning.summary(planned, machine.jobs)}; repeat the command to continue")
                     raise KeyboardInterrupt
     from endless_gym_agents.experiments import report
 
-    folder = planning.folder_of(out, scale)
     for experiment in experiments:
         written = report.write(parts[experiment.name], folder / experiment.name, scale)
-        console.print(f"{written}, with its figures and tables", soft_wrap=True)
+        console.print(f"{written}, with its figures and tables")
     if failed:
         logs = "; ".join(f"{job.title} (log {job.folder}.log)" for job in failed)
         raise ValueError(f"{len(failed)} runs failed: {logs}; repeat the command to continue")
@@ -177,7 +185,7 @@ def execute(arguments: ReproduceArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-reproduce`; returns the exit status."""
-    given = ray_session.with_address(sys.argv[1:])
+    given = jobs_ray.with_address(sys.argv[1:])
     return command.main("endless-reproduce", ReproduceArguments, execute, __doc__, given)
 
 

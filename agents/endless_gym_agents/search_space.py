@@ -13,6 +13,8 @@ from typing import Any
 from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.settings import Settings, value
 
+#: The Optuna study in the folder of a search, a journal.
+STUDY = "study.journal"
 #: A value of a parameter.
 Choice = str | int | float | bool
 #: Choices by parameter.

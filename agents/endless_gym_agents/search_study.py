@@ -1,19 +1,19 @@
 """The trials of a hyperparameter search, in an Optuna study that several processes may share.
 
 The process that runs a trial holds a lock on a file in the search's folder. The operating system releases the lock when the
-process ends for any reason, so other processes can find the trials of dead processes and resume them from their checkpoints.
-The next trial is chosen under the study's lock.
+process ends for any reason, so other processes can find the trials of dead processes, which are still running in the study, and
+resume them from their checkpoints. The next trial is chosen under the lock of the folder.
 """
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import json
 import logging
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal
@@ -21,21 +21,17 @@ from typing import IO, Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from endless_gym_agents import atomic, checkpoint, ranges, tables
-from endless_gym_agents.experiments.planning import flags
+from endless_gym_agents import atomic, checkpoint, command, jobs, ranges, tables
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.ranges import FromZero, Natural, Positive, Range
-from endless_gym_agents.search_space import Choice, Space, single_changes, space, with_choices
+from endless_gym_agents.search_space import STUDY, Choice, Space, single_changes, space, with_choices
 from endless_gym_agents.settings import Settings, to_dict
 from endless_gym_agents.train import choose_device
 
-#: Files in the folder of a search: the Optuna study, the best settings, and the folder of the locks.
-STUDY, BEST, LOCKS = "study.db", "best.json", "locks"
-#: Seconds that a process waits for another process to finish writing to the study.
-_WRITE_TIMEOUT = 60.0
-#: User attributes of a trial: index of its single change, number of the trial that it resumes, folder of the run, and whether it
-#: failed in a way that would recur.
-_SINGLE, _RESUMES, _FOLDER, _FAILED = "single", "goes_on", "folder", "failed"
+#: Files in the folder of a search: the best settings, and the folder of the locks.
+BEST, LOCKS = "best.json", "locks"
+#: User attribute of the trials that are single changes.
+_SINGLE = "single"
 
 
 @dataclass(frozen=True)
@@ -65,14 +61,13 @@ class SearchArguments:
     minutes: FromZero = 0.0
     """minutes after which no more trials start and no workers are replaced; 0 for no limit"""
     workers: Natural = 0
-    """trials that run at the same time on this machine, each in its own process; 0 for one, in this process. With --ray, the
-    limit for all machines together; 0 for as many as the resources permit"""
+    """trials that run at the same time, each in its own process; 0 for one, in this process. With --ray, on all machines
+    together; 0 for as many as the resources permit"""
     max_failures: Natural = 3
-    """largest number of killed workers that the search replaces; with --ray, largest number of times that it resumes a failed
-    trial. A trial that failed more often is resumed when the command is repeated"""
+    """largest number of failed or killed workers that the search replaces; a new worker resumes their trials"""
     ray: str = ""
-    """run the trials on Ray Tune. The flag alone starts Ray on this machine; with an address, the trials run on that cluster,
-    whose machines must share the folder of the search"""
+    """run the trials on Ray. The flag alone starts Ray on this machine; with an address, the trials run on that cluster, whose
+    machines must share the folder of the search"""
     trial_cpus: Positive = 1
     """with --ray: CPU cores of a trial"""
     trial_gpus: Annotated[float | None, Range(0)] = None
@@ -108,18 +103,18 @@ class Trial:
         asked: The `optuna.Trial`.
         settings: Settings of its run, validated.
         lock: The locked file of the trial.
+        reported: The last reported update; 0 before the first.
         reward: The last observed reward; None before the first episode has ended.
         pruned: Whether the trial should be pruned.
-        reported: The last reported update.
     """
 
     trials: Trials
     asked: Any
     settings: Settings
     lock: IO[str]
+    reported: int
     reward: float | None = None
     pruned: bool = False
-    reported: int = 0
 
     @property
     def number(self) -> int:
@@ -151,33 +146,46 @@ class Trial:
         elif self.reward is None:
             self.trials.say(f"trial {self.number}: no episode has ended; increase --ppo.updates")
         done = not self.pruned and self.reward is not None
-        self._tell("COMPLETE" if done else "PRUNED", self.reward if done else None)
+        self._end("COMPLETE" if done else "PRUNED", self.reward if done else None)
 
     def interrupt(self) -> None:
-        """Tell the study that the run was interrupted; another trial resumes it."""
-        self._tell("FAIL")
-
-    def postpone(self, reason: str) -> None:
-        """Tell the study that the run failed. Another trial resumes it in a later call of the search; in this one it would fail
-        again.
-        """
-        self.trials.say(f"trial {self.number} {reason}")
-        self.trials.postponed.add(self.number)
-        self._tell("FAIL")
+        """Release the trial, which is not done; a process resumes it from its last checkpoint."""
+        self.lock.close()
 
     def fail(self, reason: str) -> None:
         """Tell the study that the run failed in a way that would recur; it is never resumed."""
         self.trials.say(f"trial {self.number} {reason}")
-        self.asked.set_user_attr(_FAILED, True)
-        self._tell("FAIL")
+        self._end("FAIL")
 
-    def _tell(self, state: str, value: float | None = None) -> None:
-        from optuna.trial import TrialState
+    def _end(self, state: str, value: float | None = None) -> None:
+        with self.trials.locked():
+            self.trials.end_trial(self.number, self.lock, state, value)
 
-        # Set the state before releasing the lock: a running trial without a lock counts as abandoned.
-        self.trials.study.tell(self.number, value, state=TrialState[state])
-        Path(self.lock.name).unlink(missing_ok=True)
-        self.lock.close()
+
+class _JournalLock:
+    """The lock under which Optuna appends to a journal.
+
+    Optuna's own one would stay for 30 seconds after a process was killed, and a part of a line that a process wrote before it
+    was killed, or before the disk was full, would make the journal unreadable. That part is cut off.
+    """
+
+    def __init__(self, journal: Path) -> None:
+        self._journal = journal
+        self._opened: IO[bytes] | None = None
+
+    def acquire(self) -> bool:
+        """Lock the journal, and wait until no other process has locked it."""
+        self._opened = opened = self._journal.open("rb+")
+        fcntl.flock(opened, fcntl.LOCK_EX)
+        end = opened.seek(0, 2)
+        opened.seek(max(0, end - (1 << 20)))  # A line is much shorter.
+        opened.truncate(end - len(opened.read().rpartition(b"\n")[2]))
+        return True
+
+    def release(self) -> None:
+        """Release the lock."""
+        if self._opened is not None:
+            self._opened.close()
 
 
 class Trials:
@@ -189,165 +197,135 @@ class Trials:
         space: The search space.
         study: The Optuna study.
         end: Time after which no more trials begin, on the clock `time.monotonic`; infinity for no limit.
-        postponed: Numbers of the failed trials that only a later call of the search resumes.
     """
 
-    def __init__(self, arguments: SearchArguments, console: Console, end: float | None = None) -> None:
+    def __init__(self, arguments: SearchArguments, console: Console) -> None:
         """Open the study of the folder, or create it.
 
         Args:
             arguments: The arguments, validated.
             console: Where messages are printed.
-            end: The `end` of the search that this process works for; by default `arguments.minutes` from now.
 
         Raises:
+            ModuleNotFoundError: Optuna is not installed.
             ValueError: The study was created with other settings or parameters.
         """
+        command.check_installed("the search", "optuna")
         import optuna
+        from optuna.storages.journal import JournalFileBackend
 
         optuna.logging.set_verbosity(logging.ERROR)
         self.arguments, self.console, base = arguments, console, arguments.settings
         self.folder = Path(arguments.folder or f"searches/{base.env}/{base.agent_name}")
-        limit = 60 * arguments.minutes if arguments.minutes else float("inf")
-        self.end = time.monotonic() + limit if end is None else end
-        self.postponed: set[int] = set()
-        self.space: Space = space(arguments.settings, arguments.parameters)
+        self.end = time.monotonic() + (60 * arguments.minutes if arguments.minutes else float("inf"))
+        self.space: Space = space(base, arguments.parameters)
         (self.folder / LOCKS).mkdir(parents=True, exist_ok=True)
-        with self._locked():
+        journal = self.folder / STUDY
+        with self.locked():
+            backend = JournalFileBackend(str(journal), _JournalLock(journal))  # type: ignore[arg-type]
             self.study = optuna.create_study(
                 study_name="search",
-                storage=optuna.storages.RDBStorage(
-                    f"sqlite:///{self.folder / STUDY}", engine_kwargs={"connect_args": {"timeout": _WRITE_TIMEOUT}}
-                ),
+                storage=optuna.storages.JournalStorage(backend),
                 load_if_exists=True,
                 direction="maximize",
                 pruner=_pruner(arguments),
             )
-            initial = json.loads(json.dumps({"settings": to_dict(arguments.settings), "space": self.space}))
-            if self.study.user_attrs.setdefault("begun", initial) != initial:
+            # The numbers of threads depend on the machine and on the number of workers.
+            same = replace(base, threads=0, environment=replace(base.environment, num_threads=0))
+            initial = json.loads(json.dumps({"settings": to_dict(same), "space": self.space}))
+            if "begun" not in self.study.user_attrs:
+                self.study.set_user_attr("begun", initial)
+            elif self.study.user_attrs["begun"] != initial:
                 raise ValueError(
                     f"the search in {self.folder} was started with other settings or parameters; repeat them, or use another "
                     "--folder"
                 )
-            self.study.set_user_attr("begun", initial)
+            if arguments.stage != "combinations":
+                for change in single_changes(self.space):
+                    self.study.enqueue_trial(change, user_attrs={_SINGLE: True}, skip_if_exists=True)
 
     def say(self, text: str) -> None:
         """Print a line."""
         self.console.print(text, soft_wrap=True)
 
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the lock of the folder."""
+        return jobs.locked(self.folder / LOCKS / "study")
+
     def remaining(self) -> tuple[int, int]:
-        """Number of trials that are done, and of those that no process has begun."""
-        with self._locked():
-            self._enqueue()
-            states = [trial.state.name for trial in self.study.trials]
-            return states.count("COMPLETE") + states.count("PRUNED"), self._left()
+        """Number of trials that are done, and of those that no process has begun, or whose process has ended."""
+        with self.locked():
+            interrupted = [lock for number in self._numbers("RUNNING") if (lock := self._lock_of(number)) is not None]
+            for lock in interrupted:
+                lock.close()
+            return len(self._numbers("COMPLETE", "PRUNED")), len(interrupted) + self._new()
 
     def begin(self) -> Trial | None:
-        """Begin the next trial: one that was interrupted, a single change, or a combination.
+        """Begin the next trial: a single change, one that was interrupted, or a combination.
 
         Returns:
             The trial; None if none is left or the time is up.
         """
-        import optuna
-
         if time.monotonic() >= self.end:
             return None
-        with self._locked():
-            self._enqueue()
-            while self._left():
-                # A different seed for each trial: processes must not propose the same, and a restarted search must not repeat its
-                # earlier samples.
-                seed = self.arguments.settings.seed + len(self.study.trials)
-                self.study.sampler = optuna.samplers.TPESampler(seed=seed)
-                asked = self.study.ask()
-                lock = self._lock_of(asked.number)
-                assert lock is not None, "no process but this one has the trial"
+        with self.locked():
+            while (found := self._next()) is not None:
+                asked, lock = found
                 choices: dict[str, Any] = {
                     name: asked.suggest_categorical(name, listed) for name, listed in self.space.items()
                 }
-                run = self.run_folder(asked.number, asked.user_attrs)
-                settings = with_choices(self.arguments.settings, choices)
-                trial = Trial(self, asked, replace(settings, run=str(run), stop_when_learnt=False), lock)
-                self.say(f"trial {trial.number}: {self.changed(choices) or 'initial settings'}")
+                run = str(self.folder / f"trial-{asked.number:04d}")
+                settings = replace(with_choices(self.arguments.settings, choices), run=run, stop_when_learnt=False)
+                self.say(f"trial {asked.number}: {self.changed(choices) or 'initial settings'}")
                 try:
-                    trial.settings = trial.settings.validated()
+                    settings = settings.validated()
                 except ValueError as error:
-                    self.say(f"trial {trial.number} is invalid: {error}")
-                    trial.pruned = True
-                    trial.complete()
+                    self.say(f"trial {asked.number} is invalid: {error}")
+                    self.end_trial(asked.number, lock, "PRUNED")
                     continue
-                return trial
+                reported = self.study.trials[asked.number].intermediate_values
+                return Trial(self, asked, settings, lock, max(reported, default=0))
         return None
 
-    @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Hold the lock of the study."""
-        with (self.folder / LOCKS / "study").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
+    def end_trial(self, number: int, lock: IO[str], state: str, value: float | None = None) -> None:
+        """Tell the study how a trial has ended, and release its lock. The caller must hold the lock of the folder."""
+        from optuna.trial import TrialState
+
+        self.study.tell(number, value, state=TrialState[state])
+        Path(lock.name).unlink()
+        lock.close()
+
+    def _next(self) -> tuple[Any, IO[str]] | None:
+        """The next `optuna.Trial` with its lock; None if none is left. The caller must hold the lock of the folder."""
+        import optuna
+
+        if not self._numbers("WAITING"):
+            for trial in self.study.trials:
+                if trial.state.name == "RUNNING" and (lock := self._lock_of(trial.number)) is not None:
+                    return optuna.trial.Trial(self.study, trial._trial_id), lock
+        if not self._new():
+            return None
+        # A different seed for each trial: processes must not propose the same, and a restarted search must not repeat its
+        # earlier samples.
+        self.study.sampler = optuna.samplers.TPESampler(seed=self.arguments.settings.seed + len(self.study.trials))
+        asked = self.study.ask()
+        lock = self._lock_of(asked.number)
+        assert lock is not None, "no process but this one has the trial"
+        return asked, lock
 
     def _lock_of(self, number: int) -> IO[str] | None:
-        """The locked file of a trial; None if another process has locked it. The caller must hold the lock of the study."""
-        file = (self.folder / LOCKS / f"trial-{number:04d}").open("w")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-            return None
-        return file
+        """The locked file of a trial; None if another process has locked it. The caller must hold the lock of the folder."""
+        return jobs.try_lock(self.folder / LOCKS / f"trial-{number:04d}")
 
-    def _in_states(self, *states: str) -> list[Any]:
-        from optuna.trial import TrialState
+    def _numbers(self, *states: str) -> list[int]:
+        """Numbers of the trials in these states."""
+        return [trial.number for trial in self.study.trials if trial.state.name in states]
 
-        found: list[Any] = self.study.get_trials(states=tuple(TrialState[state] for state in states))
-        return found
-
-    def _left(self) -> int:
+    def _new(self) -> int:
         """Number of trials that no process has begun."""
-        waiting = len(self._in_states("WAITING"))
-        if self.arguments.stage == "single":
-            return waiting
-        combinations = sum(
-            _SINGLE not in trial.user_attrs
-            and (trial.state.name != "FAIL" or _FAILED in trial.user_attrs or trial.number in self.postponed)
-            for trial in self.study.trials
-        )
-        return waiting + max(0, self.arguments.trials - combinations)
-
-    def _enqueue(self) -> None:
-        """Enqueue the interrupted trials, and the single changes that have not been tried."""
-        from optuna.trial import TrialState
-
-        for trial in self._in_states("RUNNING"):
-            # Its process has ended.
-            if (lock := self._lock_of(trial.number)) is not None:
-                lock.close()
-                self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
-                (self.folder / LOCKS / f"trial-{trial.number:04d}").unlink(missing_ok=True)
-        resumed = {trial.user_attrs.get(_RESUMES) for trial in self.study.trials}
-        for trial in self._in_states("FAIL"):
-            folder = self.run_folder(trial.number, trial.user_attrs)
-            # A trial that ran out of GPU memory would fail again.
-            ended = trial.user_attrs.get(_FAILED) or trial.number in self.postponed
-            if str(trial.number) not in resumed and trial.params and not ended:
-                attributes = {_RESUMES: str(trial.number), _FOLDER: folder.name}
-                if _SINGLE in trial.user_attrs:
-                    attributes[_SINGLE] = trial.user_attrs[_SINGLE]
-                self.study.enqueue_trial(trial.params, user_attrs=attributes)
-        if self.arguments.stage != "combinations":
-            known = {
-                trial.user_attrs.get(_SINGLE)
-                for trial in self.study.trials
-                if trial.state is not TrialState.FAIL or trial.params
-            }
-            for number, change in enumerate(single_changes(self.space)):
-                if number not in known:
-                    self.study.enqueue_trial(change, user_attrs={_SINGLE: number})
-
-    def run_folder(self, number: int, attributes: Mapping[str, Any]) -> Path:
-        """Folder of the run of a trial with this number and these user attributes; a resumed trial uses its predecessor's."""
-        name: str = attributes.get(_FOLDER, f"trial-{number:04d}")
-        return self.folder / name
+        waiting = len(self._numbers("WAITING"))
+        combinations = sum(_SINGLE not in trial.user_attrs for trial in self.study.trials)
+        return waiting + (0 if self.arguments.stage == "single" else max(0, self.arguments.trials - combinations))
 
     def changed(self, choices: Mapping[str, Choice]) -> str:
         """The flags of `endless-train` for the choices that differ from the initial settings."""
@@ -356,7 +334,7 @@ class Trials:
             for name, choice in choices.items()
             if name in self.space and choice != self.space[name][0]
         }
-        return " ".join(flags(different))
+        return " ".join(command.flags(different))
 
     def report(self) -> None:
         """Write the best settings and all trials to `best.json`, and print the ten best; does nothing if no trial is complete.
@@ -365,7 +343,7 @@ class Trials:
         """
         from optuna.trial import TrialState
 
-        with self._locked():  # Other processes of the search write the same files.
+        with self.locked():  # Other processes of the search write the same files.
             done = self.study.get_trials(states=(TrialState.COMPLETE,))
             done.sort(key=lambda trial: -(trial.value or 0.0))
             pruned = len(self.study.get_trials(states=(TrialState.PRUNED,)))

@@ -1,6 +1,5 @@
 """User errors print one line on standard error, exit with status 1, and leave no file."""
 
-import importlib.util
 import json
 import re
 import sys
@@ -11,7 +10,9 @@ import pytest
 from endless_gym_agents import enjoy, plot, probe, protocol, record, reproduce, search, train
 
 GRID = "--env MortarMayhem-Grid-v0"
-NO_RAY = "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"
+NO_RAY = (
+    r"--ray needs ray, which is not installed: pip install './agents\[ray\]', or the wheel file with `\[ray\]` appended"
+)
 PROGRAMS = {
     "endless-train": train.main,
     "endless-eval": protocol.main,
@@ -125,7 +126,7 @@ def test_user_error_prints_one_line_and_leaves_no_file(
     experiment = {"env": "MysteryPath-v0", "label": "gru", "options": {}, "runs": [run]}
     (tmp_path / "one.json").write_text(json.dumps({"experiments": [experiment]}))
     if "--ray" in command:
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+        monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.setenv("PATH", str(tmp_path))  # without ffmpeg
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.chdir(tmp_path)

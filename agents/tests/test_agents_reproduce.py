@@ -1,24 +1,17 @@
 """The experiments of the paper as data: files, scales, plans, and runs that are stopped and resumed."""
 
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 from agents_helpers import EXPERIMENT, changed
-from test_agents_training import progress, same
 
-from endless_gym_agents import checkpoint
+from endless_gym_agents import command
 from endless_gym_agents.curves import published
-from endless_gym_agents.experiments import definitions, planning, report, running
+from endless_gym_agents.experiments import definitions, planning, report
 from endless_gym_agents.reproduce import ReproduceArguments, execute
 from endless_gym_agents.settings import to_dict
 from endless_gym_agents.train import parse
@@ -30,30 +23,6 @@ def own(folder: Path, **changes: Any) -> Path:
     file = folder / "mine.json"
     file.write_text(json.dumps(EXPERIMENT | changes))
     return file
-
-
-def start(folder: Path, out: str) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "endless_gym_agents.reproduce", str(folder / "mine.json"), "--jobs", "1"]
-    command += ["--out", str(folder / out), "--device", "cpu", "--nice", "0"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def completed(folder: Path, out: str, capfd: pytest.CaptureFixture[str]) -> str:
-    """The output of the command, run in this process, that completes the remaining work."""
-    given = ReproduceArguments((str(folder / "mine.json"),), out=folder / out, jobs=1, device="cpu", nice=0)
-    execute(given)
-    return capfd.readouterr().out
-
-
-def run_folder(folder: Path, out: str) -> Path:
-    return folder / out / "runs" / "MortarMayhem-Grid-v0" / "gru" / "seed-1"
-
-
-def wait_for_updates(run: Path, count: int) -> None:
-    log, deadline = run / "progress.jsonl", time.monotonic() + 250
-    while not log.exists() or log.read_text().count("\n") < count:
-        assert time.monotonic() < deadline, "the run did not reach its update"
-        time.sleep(0.01)
 
 
 def log_of(job: planning.Job, updates: int, seconds: float) -> None:
@@ -71,7 +40,7 @@ def test_flags_of_an_experiment_give_its_settings(name: str) -> None:
     experiment = definitions.load(name)
     for one in (experiment, planning.scaled(experiment, planning.TINY)):
         run = one.runs[-1]
-        given = parse(["--env", run.env, *planning.flags(run.flags)])
+        given = parse(["--env", run.env, *command.flags(run.flags)])
         assert given.validated() == run.settings()
         if experiment.kind == "curves" and run.published:
             assert published(run.env, [run.published]), run
@@ -134,44 +103,51 @@ def test_a_scale_makes_everything_smaller() -> None:
     assert after.recurrence == before.recurrence
 
 
-def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -> None:
-    """Two of six jobs have begun; the estimate for the others is the mean over the same agent, or over all."""
+def test_the_remaining_time_is_estimated_from_measured_updates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two of six jobs have begun; the estimate for the others is the mean over the same agent, or over all.
+
+    The updates of trxl have four times as many environment steps.
+    """
+    flags = {"ppo.updates": 10, "environment.num-envs": 8, "ppo.steps": 64}
     runs = [
-        {"name": agent, "env": "MortarMayhem-v0", "flags": {"agent": agent, "ppo.updates": 10}}
-        for agent in ("gru", "lstm", "trxl")
+        {"name": agent, "env": "MortarMayhem-v0", "flags": flags | {"agent": agent, "environment.num-envs": envs}}
+        for agent, envs in (("gru", 8), ("lstm", 8), ("trxl", 32))
     ]
-    experiment = definitions.parse("mine", json.dumps(EXPERIMENT | {"runs": runs, "seeds": 2}))
-    planned = planning.jobs(experiment, tmp_path, 1)
+    file = own(tmp_path, runs=runs, seeds=2)
+    given = ReproduceArguments((str(file),), status=True, out=tmp_path / "out", jobs=1)
+    planned = planning.jobs_of(definitions.load(str(file)), tmp_path / "out", 1)
     assert [(job.run.name, job.seed) for job in planned] == [(a, s) for s in (1, 2) for a in ("gru", "lstm", "trxl")]
-    assert planning.remaining_seconds(planned, 1) is None
-    assert "time unknown" in running.left(planned, 1)
+    execute(given)
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert lines[0] == "not started  MortarMayhem-v0 gru seed 1, update 0 of 10"
+    assert not any("left" in line for line in lines)
+    assert "time unknown before the first update" in last
     log_of(planned[0], 4, 2.0)
     log_of(planned[1], 5, 8.0)
-    # gru: 6 and 10 updates of 2 s; lstm: 5 and 10 of 8 s; trxl: twice 10 of 5 s.
-    assert planning.remaining_seconds(planned, 1) == pytest.approx(12 + 20 + 40 + 80 + 50 + 50)
-    assert planning.remaining_seconds(planned, 3) == pytest.approx(252 / 3)
+    # gru: 6 and 10 updates of 2 s; lstm: 5 and 10 of 8 s; trxl: twice 10 of 20 s.
+    assert planning.remaining_seconds(planned, 1) == pytest.approx(12 + 20 + 40 + 80 + 200 + 200)
+    assert planning.remaining_seconds(planned, 2) == pytest.approx(552 / 2)
     # More machines do not shorten the longest job.
-    assert planning.remaining_seconds(planned, 100) == pytest.approx(80)
-    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 4.2 minutes, and its evaluation")
+    assert planning.remaining_seconds(planned, 100) == pytest.approx(200)
+    execute(given)
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith("update 4 of 10, 12 seconds left")
+    assert lines[2].endswith("update 0 of 10, 3.3 minutes left, estimated from other runs")
+    assert "9 of 60 updates; the rest takes 9.2 minutes, and its evaluation" in last
     # One evaluation is measured; the five others are expected to take as long.
     (planned[1].folder / "evaluation.json").write_text('{"seconds": 12.0}')
-    assert planning.remaining_seconds(planned, 1) == pytest.approx(252 + 5 * 12)
-    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 5.2 minutes")
-
-
-def test_the_status_says_what_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ReproduceArguments((str(own(tmp_path)),), status=True, out=tmp_path / "out", jobs=1)
+    assert planning.remaining_seconds(planned, 1) == pytest.approx(552 + 5 * 12)
+    assert planning.summary(planned, 1).endswith("9 of 60 updates; the rest takes 10.2 minutes")
+    log_of(planned[2], 10, 2.0)
     execute(given)
-    assert capsys.readouterr().out.startswith("not started  MortarMayhem-Grid-v0 gru seed 1, update 0 of 6\n")
-    (job,) = planning.jobs(definitions.parse("mine", json.dumps(EXPERIMENT)), tmp_path / "out", 1)
-    log_of(job, 6, 2.0)
-    execute(given)
-    assert "MortarMayhem-Grid-v0 gru seed 1, update 6 of 6, evaluation left\n" in capsys.readouterr().out
+    assert "MortarMayhem-v0 trxl seed 1, update 10 of 10, evaluation left\n" in capsys.readouterr().out
 
 
 def test_a_run_with_other_settings_is_refused(tmp_path: Path) -> None:
     experiment = definitions.parse("mine", json.dumps(EXPERIMENT))
-    (job,) = planning.jobs(experiment, tmp_path, 1)
+    (job,) = planning.jobs_of(experiment, tmp_path, 1)
     job.folder.mkdir(parents=True)
     given = job.run.settings()
     (job.folder / "settings.json").write_text(json.dumps(to_dict(given)))
@@ -191,12 +167,6 @@ def test_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert not (tmp_path / "out").exists()
 
 
-def test_each_job_gets_a_gpu() -> None:
-    machine = running.Machine(4, ("0", "3"))
-    assert [machine.environment(slot)["CUDA_VISIBLE_DEVICES"] for slot in range(4)] == ["0", "3", "0", "3"]
-    assert running.Machine(2).environment(0) == {"OMP_NUM_THREADS": "1"}
-
-
 def test_ablation_table_takes_the_best_update() -> None:
     """The best update is that with the highest mean over the runs; updates before the first end of an episode do not count."""
     nan = float("nan")
@@ -213,7 +183,7 @@ def test_wall_time_draws_the_published_curves_over_both_times(tmp_path: Path) ->
     flags = {"agent": "gru", "ppo.updates": 3}
     runs = [{"name": "gru", "env": "MysteryPath-v0", "flags": flags, "published": "gru", "values": values}]
     experiment = definitions.parse("mine", json.dumps(EXPERIMENT | {"kind": "wall-time", "runs": runs}))
-    (job,) = planning.jobs(experiment, tmp_path, 1)
+    (job,) = planning.jobs_of(experiment, tmp_path, 1)
     log_of(job, 3, 2.0)
     (row,), (figure,) = report._wall_time([job], tmp_path / "out")
     # The paper's run has 25,000 updates, and a checkpoint every 500.
@@ -233,39 +203,6 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
     listed = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in listed] == NAMES
     assert listed[NAMES.index("endless")]["runs"][0]["updates"] == 50_000
-
-
-@pytest.mark.slow
-def test_stopped_run_equals_an_uninterrupted_one(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """A run that was killed, and then stopped by Ctrl-C, is completed; repeating the command then runs nothing."""
-    own(tmp_path)
-    run = run_folder(tmp_path, "stopped")
-    for how, update in (("kill", 2), ("interrupt", 4)):
-        begun = start(tmp_path, "stopped")
-        wait_for_updates(run, update)
-        if how == "kill":
-            (child,) = psutil.Process(begun.pid).children()
-            child.kill()
-        else:
-            begun.send_signal(signal.SIGINT)
-        text, _ = begun.communicate(timeout=280)
-        assert begun.returncode == (1 if how == "kill" else 130), text
-    assert 4 <= checkpoint.load(run).update < 6
-    assert "resumed at update" in completed(tmp_path, "stopped", capfd)
-    completed(tmp_path, "through", capfd)
-    assert (tmp_path / "through" / "mine" / "README.md").exists()
-    expected = run_folder(tmp_path, "through")
-    assert len(progress(run)) == 6
-    assert progress(run) == progress(expected)
-    assert same(*(checkpoint.load(each).state["model"] for each in (run, expected)))
-    tables = [tmp_path / out / "mine" / "table.csv" for out in ("stopped", "through")]
-    assert tables[0].read_text() == tables[1].read_text()
-    before = os.stat(run / "progress.jsonl").st_mtime_ns
-    text = completed(tmp_path, "stopped", capfd)
-    assert "1 of 1 jobs done" in text
-    assert "started" not in text
-    assert "resumed" not in text
-    assert os.stat(run / "progress.jsonl").st_mtime_ns == before
 
 
 @pytest.mark.slow

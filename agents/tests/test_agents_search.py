@@ -1,25 +1,17 @@
 """The hyperparameter search: search space, order of the trials, pruning, and resumption."""
 
 import json
-import multiprocessing
-import os
-import shutil
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from agents_helpers import changed, settings
 from rich.console import Console
 
-from endless_gym_agents import checkpoint, search, search_ray, search_workers
-from endless_gym_agents.logs import read_progress
+from endless_gym_agents import jobs, search
 from endless_gym_agents.search import parse
 from endless_gym_agents.search_space import single_changes, space, with_choices
 from endless_gym_agents.search_study import SearchArguments, Trials
@@ -109,7 +101,7 @@ def test_a_trial_that_diverges_fails_and_the_search_continues(tmp_path: Path) ->
     for _ in range(2):
         trial = trials.begin()
         assert trial is not None
-        search.run_trial(trial, trial.settings)
+        search.run_trial(trial)
     ended = {trial.params["ppo.learning_rate"]: trial.state.name for trial in trials.study.trials if trial.params}
     assert ended == {1e20: "FAIL", 2.75e-4: "COMPLETE"}
 
@@ -124,47 +116,21 @@ def test_the_best_settings_are_replaced_atomically(tmp_path: Path, monkeypatch: 
     trials = Trials(small(tmp_path, stage="single"), QUIET)
     first = trials.begin()
     assert first is not None
-    search.run_trial(first, first.settings)
+    search.run_trial(first)
     trials.report()
     with (tmp_path / "best.json").open() as old:
         search.run_trials(trials)
         trials.report()
         assert json.loads(old.read())["reward"] == 3.0
     assert json.loads((tmp_path / "best.json").read_text())["reward"] == 4.0
-    assert {file.name for file in tmp_path.iterdir()} == {"best.json", "locks", "study.db"}
+    assert {file.name for file in tmp_path.iterdir()} == {"best.json", "locks", "study.journal"}
 
 
 def test_no_trial_is_begun_after_the_time_limit(tmp_path: Path) -> None:
     trials = Trials(small(tmp_path, stage="single", minutes=1e-9), QUIET)
     search.run_trials(trials)
-    assert states(trials) == []
+    assert states(trials) == ["WAITING"] * 3
     assert Trials(small(tmp_path, stage="single"), QUIET).remaining() == (0, 3)
-
-
-def test_a_failed_trial_is_resumed_only_by_the_next_call(tmp_path: Path) -> None:
-    """Ray reports a trial that failed too often; one that ran out of memory is never resumed."""
-    first = search_ray._Study(Trials(small(tmp_path, trials=2, stage="combinations"), QUIET))
-    configuration = first.begin("a")
-    assert configuration is not None
-    run = configuration["settings"]["run"]
-    first.end("a", is_error=True)
-    assert first.begin("b") is not None
-    first._ended["b"] = "ran out of GPU memory"
-    first.end("b", is_error=False)
-    # The failed trial counts as one of the combinations.
-    assert first.begin("c") is None
-    assert first.failed == [0]
-
-    trials = Trials(small(tmp_path, trials=2, stage="combinations"), QUIET)
-    assert trials.remaining() == (0, 1)
-    second = search_ray._Study(trials)
-    resumed = second.begin("d")
-    assert resumed is not None
-    assert resumed["settings"]["run"] == run
-    second.observe("d", {"update": 3, "reward": 1.0, "end": "done"})
-    second.end("d", is_error=False)
-    assert second.begin("e") is None
-    assert states(trials) == ["FAIL", "FAIL", "COMPLETE"]
 
 
 @pytest.mark.slow
@@ -181,13 +147,13 @@ def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkey
     broken = Trials(small(tmp_path / "broken", stage="single"), QUIET)
     with pytest.raises(KeyboardInterrupt):
         search.run_trials(broken)
-    assert states(broken) == ["FAIL", "WAITING", "WAITING"]
+    assert states(broken) == ["RUNNING", "WAITING", "WAITING"]
     if not with_checkpoint:
         (tmp_path / "broken" / "trial-0000" / "checkpoints" / "last.pt").unlink()
     monkeypatch.setattr(search, "train", train)
     resumed = Trials(small(tmp_path / "broken", stage="single"), QUIET)
     search.run_trials(resumed)
-    assert states(resumed) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
+    assert states(resumed) == ["COMPLETE"] * 3
 
     assert values(resumed) == values(through)
     assert not (tmp_path / "broken" / "trial-0003").exists()
@@ -223,135 +189,59 @@ def test_trials_that_fall_behind_are_pruned(
     assert trials.study.best_params == {"ppo.epochs": 4}
 
 
-def killed_once(trials: Trials, threads: int | None) -> None:
-    """Work of a worker: the first two trials wait for each other, then the process of the first one is killed, once."""
-    folder = trials.folder
-
-    def trained(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
-        def watched(update: int, means: dict[str, float]) -> bool:
-            stops = watch(update, means)
-            if update == 3:
-                (folder / f"met-{Path(given.run).name}").touch()
-                while len(list(folder.glob("met-*"))) < 2:
-                    time.sleep(0.01)
-                if given.run.endswith("trial-0000") and not (folder / "killed").exists():
-                    shutil.copy(Path(given.run) / "progress.jsonl", folder / "killed")
-                    os.kill(os.getpid(), signal.SIGKILL)
-            return stops
-
-        return train(given, watched)
-
-    search.train = trained
-    search.run_trials(trials, threads)
-
-
-@pytest.mark.slow
-def test_workers_resume_only_the_trial_of_a_killed_worker(tmp_path: Path) -> None:
-    def given(name: str) -> SearchArguments:
-        given = small(tmp_path / name, stage="single", workers=2)
-        return replace(given, settings=changed(given.settings, ppo={"updates": 4}, checkpoint_interval=1))
-
-    through = Trials(given("through"), QUIET)
-    search.run_trials(through)
-    shared = Trials(given("shared"), QUIET)
-    search_workers.run_workers(shared, killed_once)
-    assert states(shared) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
-    assert [file.name for file in (tmp_path / "shared/locks").iterdir()] == ["study"]
-
-    assert values(shared) == values(through)
-    # The rows up to the checkpoint are those of the killed process, with its times.
-    before = (tmp_path / "shared/killed").read_text().splitlines()
-    rows = (tmp_path / "shared/trial-0000/progress.jsonl").read_text().splitlines()
-    assert [json.loads(row)["update"] for row in rows] == [1, 2, 3, 4]
-    assert len(before) == 3
-    assert (rows[:2], rows[2] == before[2]) == (before[:2], False)
-    assert "resumed" not in (tmp_path / "shared/trial-0001.log").read_text()
-
-
-def killed_and_replaced(trials: Trials, threads: int | None) -> None:
-    """Work of a worker that is killed, once."""
-    with (trials.folder / "ends").open("a") as ends:
-        print(repr(trials.end), file=ends)
-    if len((trials.folder / "ends").read_text().splitlines()) == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-@pytest.mark.slow
-def test_a_replaced_worker_keeps_the_time_limit_of_the_search(tmp_path: Path) -> None:
-    trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
-    search_workers.run_workers(trials, killed_and_replaced)
-    assert (tmp_path / "ends").read_text() == f"{trials.end!r}\n" * 2
-
-
-@pytest.mark.slow
-def test_a_worker_is_not_replaced_after_the_time_limit(tmp_path: Path) -> None:
-    trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
+def test_a_new_worker_has_the_rest_of_the_time(tmp_path: Path) -> None:
+    given = small(tmp_path, stage="single", workers=2, minutes=5.0)
+    trials = Trials(replace(given, settings=replace(given.settings, threads=3)), QUIET)
+    worker = search.Worker(trials, ("--workers", "2", "--minutes", "5"), 0)
+    trials.end -= 60
+    (command,) = worker.begin(jobs.Machine(2, job_cores=7))
+    parsed = parse(command[1:])
+    assert 3.9 < parsed.minutes < 4
+    assert (parsed.workers, parsed.folder, parsed.ray) == (0, str(tmp_path), "")
+    # The threads of the machine, where the settings choose none.
+    assert (parsed.settings.threads, parsed.settings.environment.num_threads) == (0, 7)
     trials.end = time.monotonic()
-    with pytest.raises(ValueError, match="1 of 1 workers failed; repeat the command"):
-        search_workers.run_workers(trials, killed_and_replaced)
-    assert len((tmp_path / "ends").read_text().splitlines()) == 1
+    assert worker.begin(jobs.Machine(2)) == []
 
 
-def test_the_log_of_a_trial_says_why_it_failed(tmp_path: Path) -> None:
-    given = settings("gru", run=str(tmp_path / "trial-0000"))
-    with pytest.raises(RuntimeError), search_workers.output_of(given):
-        print("before")
-        raise RuntimeError("the cause")
-    first, *_, last = (tmp_path / "trial-0000.log").read_text().splitlines()
-    assert (first, last) == ("before", "RuntimeError: the cause")
+def test_a_part_of_a_line_in_the_journal_is_cut_off(tmp_path: Path) -> None:
+    """As of a process that was killed, or of a full disk."""
+    trials = Trials(small(tmp_path, stage="single"), QUIET)
+    journal = tmp_path / "study.journal"
+    before = journal.read_bytes()
+    journal.write_bytes(before + before.splitlines()[-1][:20])
+    trial = Trials(small(tmp_path, stage="single"), QUIET).begin()
+    assert trial is not None
+    trial.reward = 1.0
+    trial.complete()
+    assert journal.read_bytes().startswith(before)
+    assert states(trials) == ["COMPLETE", "WAITING", "WAITING"]
 
 
-def interrupted_or_late(trials: Trials, threads: int | None) -> None:
-    """Work of a worker that only a signal ends in time."""
-    time.sleep(30)
-    (trials.folder / "late").touch()
-
-
-@pytest.mark.slow
-def test_a_signal_while_workers_are_started_stops_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    process = multiprocessing.get_context("spawn").Process
-    start, started = process.start, []
-
-    def interrupting(self: Any) -> None:
-        start(self)
-        started.append(self.name)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(process, "start", interrupting)
-    with pytest.raises(KeyboardInterrupt):
-        search_workers.run_workers(Trials(small(tmp_path, stage="single", workers=2), QUIET), interrupted_or_late)
-    assert started == ["endless-search-0"]
-    assert not (tmp_path / "late").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) -> None:
-    """Even if the search is killed, the workers stop after their update, with checkpoints, as if interrupted."""
-    command = [sys.executable, "-m", "endless_gym_agents.search", "--preset", "quick", "--folder", str(tmp_path)]
-    sizes = ["--environment.num-envs", "4", "--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "100000"]
-    choice = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single", "--workers", "2"]
-    with subprocess.Popen([*command, *sizes, *choice], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as started:
-        try:
-            runs = [tmp_path / f"trial-000{number}" for number in (0, 1)]
-            while not all((run / "progress.jsonl").exists() and read_progress(run) for run in runs):
-                assert started.poll() is None, started.communicate()[0]
-                time.sleep(0.05)
-            workers = [
-                child for child in psutil.Process(started.pid).children() if "spawn_main" in " ".join(child.cmdline())
-            ]
-            assert len(workers) == 2
-            started.send_signal(number)
-            assert started.wait(60) == (130 if number == signal.SIGINT else -number)
-            assert not psutil.wait_procs(workers, timeout=60)[1]
-        finally:
-            started.kill()  # its workers stop with it
-    for run in runs:
-        assert checkpoint.load(run).update == read_progress(run)[-1]["update"]
-    given = parse([*command[3:], *sizes, *choice])
-    left = Trials(given, QUIET)
-    assert states(left) == ["FAIL", "FAIL", "WAITING"]
-    assert left.remaining() == (0, 3)
+def test_a_trial_that_its_process_did_not_end_is_resumed(tmp_path: Path) -> None:
+    """It keeps its number and its choices, after those that have not begun. One that ran out of GPU memory is never resumed."""
+    arguments = small(tmp_path, trials=2, stage="combinations")
+    trials = Trials(arguments, QUIET)
+    first, second = trials.begin(), trials.begin()
+    assert first is not None
+    assert second is not None
+    assert trials.begin() is None
+    assert Trials(arguments, QUIET).begin() is None
+    first.observe(1, 5.0)
+    first.interrupt()
+    second.fail("ran out of GPU memory")
+    other = Trials(arguments, QUIET)
+    assert other.remaining() == (0, 1)
+    resumed = other.begin()
+    assert resumed is not None
+    assert (resumed.number, resumed.settings, resumed.reported) == (first.number, first.settings, 1)
+    assert other.begin() is None
+    resumed.observe(1, 6.0)
+    resumed.observe(2, 7.0)
+    resumed.complete()
+    assert states(trials) == ["COMPLETE", "FAIL"]
+    assert trials.study.trials[0].intermediate_values == {1: 5.0, 2: 7.0}
+    assert [file.name for file in (tmp_path / "locks").iterdir()] == ["study"]
 
 
 def test_command_line_includes_the_training_flags() -> None:

@@ -5,23 +5,23 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
-
-from endless_gym_agents import checkpoint, regular
+from endless_gym_agents import checkpoint, command, jobs, regular
+from endless_gym_agents.clock import duration
 from endless_gym_agents.experiments.definitions import Evaluation, Experiment, Run, Value
 from endless_gym_agents.logs import PROGRESS, read_progress
-from endless_gym_agents.search_space import space
+from endless_gym_agents.search_space import STUDY, space
 
 #: The scale `tiny`: one update of most runs.
 TINY = 1 / 50_000
-#: Files of a job: the results of its evaluation, measurement or search.
-EVALUATION, SPEED, FINISHED = "evaluation.json", "speed.json", "finished.json"
+#: Files of a job: the results of its evaluation, and of its measurement of speed.
+EVALUATION, SPEED = "evaluation.json", "speed.json"
 State = Literal["done", "interrupted", "not started"]
 
 
@@ -33,13 +33,18 @@ class Job:
         experiment: The experiment, at its scale.
         run: The run, with the flags at that scale.
         seed: Seed of the training.
-        folder: Folder of the run, shared by all experiments that contain the run.
+        out: Folder of all runs and reports at that scale.
     """
 
     experiment: Experiment
     run: Run
     seed: int
-    folder: Path
+    out: Path
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the run, shared by all experiments that contain the run."""
+        return self.out / "runs" / self.run.env / self.run.name / f"seed-{self.seed}"
 
     @property
     def title(self) -> str:
@@ -57,33 +62,59 @@ class Job:
         rows = read_progress(self.folder) if (self.folder / PROGRESS).exists() else []
         return int(rows[-1]["update"]) if rows else 0
 
-    def trained(self) -> bool:
-        """Whether the run has a checkpoint of its last update."""
-        last = self.folder / checkpoint.FOLDER / checkpoint.LAST
-        if self.updates_done() < self.updates or not last.exists():
-            return False
-        regular.opened(last).close()
-        return int(torch.load(last, map_location="cpu", weights_only=True, mmap=True)["update"]) >= self.updates
-
     def state(self) -> State:
         """Whether the job is done, and if not, whether it can be resumed."""
-        kind = self.experiment.kind
-        result = {"curves": EVALUATION, "simulation-speed": SPEED, "search": FINISHED}.get(kind, PROGRESS)
-        if _complete(self.folder / result) and (not self.updates or self.trained()):
+        if not self.commands(jobs.Machine(1)):
             return "done"
-        begun = (self.folder / checkpoint.FOLDER / checkpoint.LAST).exists() or (self.folder / "study.db").exists()
-        return "interrupted" if begun else "not started"
+        begun = (checkpoint.last(self.folder), self.folder / STUDY)
+        return "interrupted" if any(file.exists() for file in begun) else "not started"
 
+    def begin(self, machine: jobs.Machine) -> list[list[str]]:
+        """Prepare the folder, and return the commands that are left."""
+        if self.updates and not checkpoint.last(self.folder).exists() and (self.folder / checkpoint.SETTINGS).exists():
+            shutil.rmtree(self.folder)  # The run was killed before its first checkpoint.
+        self.folder.mkdir(exist_ok=True)
+        return self.commands(machine)
 
-def _complete(file: Path) -> bool:
-    """Whether a file exists and is complete; a process may have been killed while it wrote JSON."""
-    if not file.exists() or file.name == PROGRESS:
-        return file.exists()
-    try:
-        json.loads(regular.text(file))
-    except json.JSONDecodeError:
-        return False
-    return True
+    def has_succeeded(self) -> bool:
+        """Whether all updates are done; `endless-train` also ends with status 0 if it was interrupted."""
+        return self.updates_done() >= self.updates
+
+    def progress(self) -> str:
+        """The updates so far, or nothing before a checkpoint."""
+        begun = self.updates and checkpoint.last(self.folder).exists()
+        return f"at update {self.updates_done()} of {self.updates}" if begun else ""
+
+    def commands(self, machine: jobs.Machine) -> list[list[str]]:
+        """The command lines that are left, in order; the first word of each is a program of this package."""
+        experiment, run, folder = self.experiment, self.run, str(self.folder)
+        here = ["--device", machine.device, "--threads", "1"]
+        own = ["--env", run.env, *command.flags(run.flags), "--seed", str(self.seed)]
+        train = [*here, "--environment.num-threads", str(machine.engine_threads)]
+        if experiment.kind == "simulation-speed":
+            speed = ["--env", run.env, "--episodes", str(experiment.episodes), "--json", str(self.folder / SPEED)]
+            wanted = [["endless-speed", *speed]]
+        elif experiment.kind == "search":
+            given = experiment.search
+            search = ["--folder", folder, "--trials", str(given.trials), "--warm-up", str(given.warm_up)]
+            search += ["--parameters", *given.parameters] if given.parameters else []
+            wanted = [["endless-search", *search, *own, *train]]
+        elif checkpoint.last(self.folder).exists():
+            wanted = [["endless-train", "--resume", folder, *train]]
+        else:
+            wanted = [["endless-train", *own, "--run", folder, *train]]
+        if experiment.kind == "curves":
+            protocol = experiment.evaluation
+            if "--run" in wanted[0]:
+                wanted[0] += ["--checkpoint-interval", str(protocol.interval), "--keep-checkpoints"]
+            test = ["--seeds", str(protocol.seeds), "--repetitions", str(protocol.repetitions), *here]
+            test += ["--engine-threads", str(machine.engine_threads), "--json", str(self.folder / EVALUATION)]
+            wanted.append(["endless-eval", folder, *test])
+        result = {"curves": EVALUATION, "simulation-speed": SPEED, "search": STUDY}.get(experiment.kind, PROGRESS)
+        left = jobs.listed(self.out / jobs.LIST).get(self.title, {}).get("left", len(wanted))
+        # The folder, or the result of the last command, may have been removed.
+        left = max(left, not (self.folder / result).exists()) if self.folder.exists() else len(wanted)
+        return wanted[len(wanted) - left :]
 
 
 def read_scale(text: str) -> float:
@@ -149,7 +180,7 @@ def scaled(experiment: Experiment, scale: float) -> Experiment:
     )
 
 
-def jobs(experiment: Experiment, out: Path, scale: float, seeds: Sequence[int] = ()) -> list[Job]:
+def jobs_of(experiment: Experiment, out: Path, scale: float, seeds: Sequence[int] = ()) -> list[Job]:
     """The jobs of an experiment at a scale, ordered by seed, then by run.
 
     Args:
@@ -159,13 +190,8 @@ def jobs(experiment: Experiment, out: Path, scale: float, seeds: Sequence[int] =
         seeds: Seeds; empty for 1 to the number that the experiment names.
     """
     experiment = scaled(experiment, scale)
-    folder = folder_of(out, scale) / "runs"
     chosen = tuple(seeds) or range(1, experiment.seeds + 1)
-    return [
-        Job(experiment, run, seed, folder / run.env / run.name / f"seed-{seed}")
-        for seed in chosen
-        for run in experiment.runs
-    ]
+    return [Job(experiment, run, seed, folder_of(out, scale)) for seed in chosen for run in experiment.runs]
 
 
 def folder_of(out: Path, scale: float) -> Path:
@@ -191,53 +217,6 @@ def check_folders(planned: Sequence[Job]) -> None:
                 )
 
 
-def flags(values: Mapping[str, Value]) -> list[str]:
-    """Command-line arguments for flags and their values."""
-    arguments: list[str] = []
-    for name, value in values.items():
-        if isinstance(value, bool):
-            group, dot, entry = name.rpartition(".")
-            arguments.append(f"--{name}" if value else f"--{group}{dot}no-{entry}")
-        else:
-            arguments += [f"--{name}", *(map(str, value) if isinstance(value, list) else [str(value)])]
-    return arguments
-
-
-def commands(job: Job, device: str, engine_threads: int) -> list[list[str]]:
-    """The command lines that a job still has to run, in order; the first word of each is a program of this package.
-
-    Args:
-        job: The job.
-        device: Device of the agent, as for `endless-train`.
-        engine_threads: Threads that step the environments.
-    """
-    experiment, run, folder = job.experiment, job.run, str(job.folder)
-    state = job.state()
-    if state == "done":
-        return []
-    if experiment.kind == "simulation-speed":
-        speed = ["endless-speed", "--env", run.env, "--episodes", str(experiment.episodes)]
-        return [[*speed, "--json", str(job.folder / SPEED)]]
-    here = ["--device", device, "--threads", "1", "--environment.num-threads", str(engine_threads)]
-    own = ["--env", run.env, *flags(run.flags), "--seed", str(job.seed)]
-    if experiment.kind == "search":
-        given = experiment.search
-        search = ["--folder", folder, "--trials", str(given.trials), "--warm-up", str(given.warm_up)]
-        search += ["--parameters", *given.parameters] if given.parameters else []
-        return [["endless-search", *search, *own, *here]]
-    wanted = [["endless-train", *own, "--run", folder, *here]]
-    if state == "interrupted":
-        wanted = [] if job.trained() else [["endless-train", "--resume", folder, *here]]
-    if experiment.kind == "curves":
-        protocol = experiment.evaluation
-        if wanted and state == "not started":
-            wanted[0] += ["--checkpoint-interval", str(protocol.interval), "--keep-checkpoints"]
-        test = ["--seeds", str(protocol.seeds), "--repetitions", str(protocol.repetitions)]
-        test += ["--device", device, "--threads", "1", "--engine-threads", str(engine_threads)]
-        wanted.append(["endless-eval", folder, *test, "--json", str(job.folder / EVALUATION)])
-    return wanted
-
-
 def update_seconds(job: Job) -> list[float]:
     """Seconds of each update in the log of a job's run."""
     rows = read_progress(job.folder) if (job.folder / PROGRESS).exists() else []
@@ -247,7 +226,7 @@ def update_seconds(job: Job) -> list[float]:
 def evaluation_seconds(job: Job) -> float | None:
     """Time of a job's evaluation; None if it has none, or before it is done."""
     file = job.folder / EVALUATION
-    return json.loads(regular.text(file)).get("seconds") if _complete(file) else None
+    return json.loads(regular.text(file)).get("seconds") if file.exists() else None
 
 
 def _estimate(planned: Sequence[Job], measured: Callable[[Job], float | None]) -> Callable[[Job], float] | None:
@@ -296,7 +275,7 @@ def seconds_left(planned: Sequence[Job]) -> list[float] | None:
     left = [max(0, job.updates - job.updates_done()) * steps(job) * training(job) for job in planned]
     if evaluation is not None:
         for number, job in enumerate(planned):
-            if job.experiment.kind == "curves" and not _complete(job.folder / EVALUATION):
+            if job.experiment.kind == "curves" and not (job.folder / EVALUATION).exists():
                 left[number] += evaluation(job)
     return left
 
@@ -310,6 +289,24 @@ def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None
     """
     left = seconds_left(planned)
     return None if left is None else max(sum(left) / side_by_side, max(left))
+
+
+def summary(planned: Sequence[Job], side_by_side: int) -> str:
+    """One line with the progress of the jobs and the estimated remaining time."""
+    states = [job.state() for job in planned]
+    trained, total = sum(min(job.updates_done(), job.updates) for job in planned), sum(job.updates for job in planned)
+    text = f"{states.count('done')} of {len(planned)} jobs done, {states.count('interrupted')} begun"
+    if total:
+        text += f", {trained:,} of {total:,} updates"
+        seconds = remaining_seconds(planned, side_by_side)
+        evaluated = [evaluation_seconds(job) is not None for job in planned if job.experiment.kind == "curves"]
+        if trained < total and seconds is None:
+            text += "; time unknown before the first update"
+        elif seconds:
+            text += f"; the rest takes {duration(seconds)}" + (
+                ", and its evaluation" if evaluated and not any(evaluated) else ""
+            )
+    return text
 
 
 def as_json(experiment: Experiment, scale: float) -> dict[str, Any]:
