@@ -107,7 +107,11 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
 
     Returns:
         Path of the PNG file.
+
+    Raises:
+        ModuleNotFoundError: Matplotlib is not installed.
     """
+    command.check_installed("a plot", "matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -58,6 +58,7 @@ def train(
         The folder of the run, with `settings.json`, `progress.jsonl`, the TensorBoard files and `checkpoints`.
 
     Raises:
+        ModuleNotFoundError: TensorBoard is not installed.
         RankLost: Another process of the run has ended.
         ValueError: The settings are invalid, or do not fit the run to resume.
         MissingRow: The log of the run to resume has no row of an update before its checkpoint.
@@ -67,6 +68,7 @@ def train(
         EngineLost: The engine process failed, and was not replaced; see `Settings.on_engine_failure`.
         Diverged: A loss, a gradient or the weights are no longer finite. The last checkpoint is from before.
     """
+    command.check_installed("training", "tensorboard")
     settings, ranks = settings.validated(), Ranks()
     ranks.check(settings.environment.num_envs, settings.environment.groups)
     device = choose_device(settings.device, ranks)

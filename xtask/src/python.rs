@@ -107,8 +107,7 @@ fn libraries() -> Result<PathBuf, String> {
 
 /// The agents' virtual environment, with the wheel and the agents.
 fn agents() -> Result<PathBuf, String> {
-    let folder =
-        sync("agents", "agents", &["--extra", "ray", "--group", "dev", "--no-install-package", "endless-gym"])?;
+    let folder = sync("agents", "agents", &["--all-extras", "--group", "dev", "--no-install-package", "endless-gym"])?;
     install_with_agents(&folder)?;
     Ok(folder)
 }
