@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,28 +13,41 @@ from pathlib import Path
 def replacing(file: str | Path) -> Iterator[Path]:
     """Yield the path of a new file in the same folder, which replaces `file` once the block has ended and it is on disk.
 
-    A link is followed. What is not a regular file, such as a pipe or `/dev/stdout`, is yielded itself.
+    The file keeps the mode of the one that it replaces. A link is replaced, and its target kept. What is not a regular file, such
+    as a pipe or `/dev/stdout`, is yielded itself.
 
     Raises:
-        OSError: The file cannot be written; it then has its former content.
+        OSError: The file cannot be written; it then has its former content, or the new one if only its folder cannot be flushed.
     """
     file = Path(file)
     if (file.exists() and not file.is_file()) or str(file).startswith(("/dev/std", "/dev/fd/", "/proc/")):
         yield file
         return
-    file = Path(os.path.realpath(file))
     new = file.with_name(f"{file.name}.new")
     # What a killed process left. It may also be a link, whose target must not be written.
     new.unlink(missing_ok=True)
+    new.touch(exist_ok=False)
     try:
+        former = file if file.is_file() and not file.is_symlink() else new
+        mode = stat.S_IMODE(former.stat().st_mode)
+        new.chmod(mode | stat.S_IWUSR)
         yield new
-        with new.open("rb") as written:
-            os.fsync(written.fileno())
-        os.replace(new, file)
+        _flush(new)
+        new.chmod(mode)
+        new.replace(file)
     except BaseException:
         with contextlib.suppress(OSError):
             new.unlink()
         raise
+    _flush(file.parent)
+
+
+def _flush(path: Path) -> None:
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
 
 
 def write(file: str | Path, content: str | bytes | memoryview) -> None:

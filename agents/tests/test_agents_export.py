@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import resource
+import stat
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -185,10 +186,14 @@ def test_a_failed_write_keeps_the_former_file(tmp_path: Path) -> None:
     assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == errno.EFBIG
     assert file.read_bytes() == former and (tmp_path / "victim").read_text() == "kept"
     assert not (tmp_path / "agent.safetensors.new").is_symlink()
-    # A link is followed, and a pipe is no file to replace.
+    # A link is replaced, as by the Rust trainer, a mode is kept, and a pipe is no file to replace.
     (tmp_path / "link").symlink_to("agent.safetensors")
     atomic.write(tmp_path / "link", "new")
-    assert (tmp_path / "link").is_symlink() and file.read_text() == "new"
+    assert not (tmp_path / "link").is_symlink() and file.read_bytes() == former
+    for mode in (0o600, 0o666, 0o400):
+        file.chmod(mode)
+        atomic.write(file, "private")
+        assert stat.S_IMODE(file.stat().st_mode) == mode and file.read_text() == "private"
     reading, writing = os.pipe()
     atomic.write(f"/dev/fd/{writing}", b"piped")
     assert os.read(reading, 9) == b"piped"

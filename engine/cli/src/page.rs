@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use endless_gym_core::files;
 use endless_gym_core::pool::Registry;
 use serde_json::Value as Json;
 
@@ -40,15 +41,15 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
             architecture wasm32; a crate that `endless new` writes shows how"
             .into());
     }
-    let files = endless_gym_page::files(&bytes, |id| registry.spec(id).is_ok());
-    for (name, bytes) in &files {
+    let page = endless_gym_page::files(&bytes, |id| registry.spec(id).is_ok());
+    for (name, bytes) in &page {
         let to = args.out.join(name);
-        let written = fs::create_dir_all(&args.out).and_then(|()| fs::write(&to, bytes));
+        let written = fs::create_dir_all(&args.out).and_then(|()| files::replace(&to, bytes));
         written.map_err(|error| format!("cannot write {}: {error}", to.display()))?;
     }
     print(format_args!(
         "wrote the page, {} files, to {}; a web server shows it:\n\n  python -m http.server --directory {}",
-        files.len(),
+        page.len(),
         args.out.display(),
         args.out.display()
     ))

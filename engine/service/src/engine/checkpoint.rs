@@ -118,22 +118,12 @@ pub(crate) fn write(path: &Path, head: &CheckpointHead, groups: Vec<SavedGroup>)
     bytes[..4].copy_from_slice(&MAGIC);
     bytes[4..8].copy_from_slice(&CHECKPOINT_VERSION.to_le_bytes());
     bytes[8..PREAMBLE].copy_from_slice(&checksum.to_le_bytes());
-    let new = new_path(path);
-    let written = create(&new).and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()));
-    let replaced = written.and_then(|()| fs::rename(&new, path));
-    replaced.and_then(|()| File::open(directory(path))?.sync_all()).map_err(|e| {
-        let _ = fs::remove_file(&new);
-        failed(e.to_string())
-    })
+    files::replace(path, &bytes).map_err(|e| failed(e.to_string()))
 }
 
 /// Checks early that a checkpoint can be written.
 pub(crate) fn check_writable(path: &Path) -> Result<(), CheckpointError> {
-    let new = new_path(path);
-    let created = if path.is_dir() { Err(ErrorKind::IsADirectory.into()) } else { create(&new).map(drop) };
-    created
-        .and_then(|()| fs::remove_file(&new))
-        .map_err(|e| CheckpointError::Write { path: path.to_owned(), reason: e.to_string() })
+    files::check_replaceable(path).map_err(|e| CheckpointError::Write { path: path.to_owned(), reason: e.to_string() })
 }
 
 /// Reads the groups of a checkpoint saved with this head; `None` if there is no file.
@@ -173,24 +163,6 @@ fn decode(path: &Path, bytes: &[u8], head: &CheckpointHead) -> Result<Vec<SavedG
         return Err(damaged(&"the number of its groups differs from its head"));
     }
     Ok(content.groups)
-}
-
-fn new_path(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".new");
-    name.into()
-}
-
-/// Creates the file that becomes the checkpoint, instead of one that a killed engine left. A link there is replaced, not followed.
-fn create(new: &Path) -> std::io::Result<File> {
-    match fs::remove_file(new) {
-        Err(e) if e.kind() != ErrorKind::NotFound => Err(e),
-        _ => File::create_new(new),
-    }
-}
-
-fn directory(path: &Path) -> &Path {
-    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Saves the environments of an engine. A periodic checkpoint stalls the engine only while it copies their states:
@@ -441,7 +413,6 @@ mod tests {
         };
         write(&path, &head, groups.clone()).unwrap();
         assert_eq!(read(&path, &head).unwrap(), Some(groups));
-        assert!(!new_path(&path).exists());
         let bytes = fs::read(&path).unwrap();
         fs::remove_file(&path).unwrap();
         assert_eq!(read(&path, &head).unwrap(), None);
