@@ -110,9 +110,9 @@ pub mod raster {
 pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Drawn, Engine,
-        EngineActivity, EngineConfig, EngineHandle, EngineProcesses, EngineStatus, EngineSummary, ErrorKind,
-        GroupReconnection, GroupStatus, LastRequest, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed,
-        Observer, ObserverStatus, Observers, Pictures, ROOT_VARIABLE, Reconnection, Rejection, ServiceError,
+        EngineActivity, EngineConfig, EngineHandle, EngineProcesses, EngineStatus, EngineStopper, EngineSummary,
+        ErrorKind, GroupReconnection, GroupStatus, LastRequest, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace,
+        Observed, Observer, ObserverStatus, Observers, Pictures, ROOT_VARIABLE, Reconnection, Rejection, ServiceError,
         ServiceSpecification, Trainer, TrainerGroup, running_engines, timeout_from_seconds,
     };
 }

@@ -1,7 +1,6 @@
 //! The service with real processes: engines and trainers are started, killed and restarted.
 
 use std::fs::File;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::support::foreign::{self, Foreign, RequestHeader};
@@ -70,51 +69,46 @@ fn groups_are_reset_and_stepped_independently() {
 #[test]
 fn mistakes_of_a_trainer_are_typed_errors() {
     let place = Place::new();
-    let stop = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        let mut engine = Engine::new(memory_gym(), &place.engine_config("gym", 2, 1)).unwrap();
-        let stop = &stop;
-        let running = scope.spawn(move || engine.run(stop).unwrap());
-        let mut trainer = place.trainer("gym").unwrap();
-        let width = trainer.specification().action_space.width();
+    let engine = Engine::new(memory_gym(), &place.engine_config("gym", 2, 1)).unwrap().spawn().unwrap();
+    let mut trainer = place.trainer("gym").unwrap();
+    let width = trainer.specification().action_space.width();
 
-        assert_error!(trainer.reset(1, ResetRequest::All), ServiceError::NoSuchGroup { given: 1, .. });
-        assert_error!(trainer.receive(0, TIMEOUT), ServiceError::NothingSent { group: 0 });
-        assert_error!(trainer.receive_any(TIMEOUT), ServiceError::NothingPending);
-        let reset = ResetRequest::Each(&[EnvReset::Next]);
-        assert_error!(trainer.reset(0, reset), ServiceError::ResetCount { given: 1, num_envs: 2 });
-        let wrong = trainer.send(0, &[0]);
-        assert_error!(wrong, ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }));
+    assert_error!(trainer.reset(1, ResetRequest::All), ServiceError::NoSuchGroup { given: 1, .. });
+    assert_error!(trainer.receive(0, TIMEOUT), ServiceError::NothingSent { group: 0 });
+    assert_error!(trainer.receive_any(TIMEOUT), ServiceError::NothingPending);
+    let reset = ResetRequest::Each(&[EnvReset::Next]);
+    assert_error!(trainer.reset(0, reset), ServiceError::ResetCount { given: 1, num_envs: 2 });
+    let wrong = trainer.send(0, &[0]);
+    assert_error!(wrong, ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }));
 
-        // The environments must be reset before the first step.
-        trainer.send(0, &vec![0; 2 * width]).unwrap();
-        assert_rejected(trainer.receive(0, TIMEOUT), Rejection::NotReset, "");
+    // The environments must be reset before the first step.
+    trainer.send(0, &vec![0; 2 * width]).unwrap();
+    assert_rejected(trainer.receive(0, TIMEOUT), Rejection::NotReset, "");
 
-        trainer.reset(0, ResetRequest::All).unwrap();
-        assert_error!(trainer.reset(0, ResetRequest::All), ServiceError::AnswerPending { group: 0 });
-        // The number of actions is checked before the pending answer, their range after it.
-        assert_error!(trainer.send(0, &[0]), ServiceError::Action(ActionError::Count { .. }));
-        assert_error!(trainer.send(0, &vec![99; 2 * width]), ServiceError::AnswerPending { group: 0 });
-        trainer.receive(0, TIMEOUT).unwrap();
+    trainer.reset(0, ResetRequest::All).unwrap();
+    assert_error!(trainer.reset(0, ResetRequest::All), ServiceError::AnswerPending { group: 0 });
+    // The number of actions is checked before the pending answer, their range after it.
+    assert_error!(trainer.send(0, &[0]), ServiceError::Action(ActionError::Count { .. }));
+    assert_error!(trainer.send(0, &vec![99; 2 * width]), ServiceError::AnswerPending { group: 0 });
+    trainer.receive(0, TIMEOUT).unwrap();
 
-        let mut actions = vec![0; 2 * width];
-        actions[width] = 99;
-        let wrong = trainer.send(0, &actions);
-        assert_error!(wrong, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given.starts_with("[99"));
+    let mut actions = vec![0; 2 * width];
+    actions[width] = 99;
+    let wrong = trainer.send(0, &actions);
+    assert_error!(wrong, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given.starts_with("[99"));
 
-        let mut held = Vec::new();
-        for _ in 0..trainer.specification().batches_held {
-            held.push(step(&mut trainer, 0));
-        }
-        assert_error!(try_step(&mut trainer, 0), ServiceError::TooManyBatchesHeld { group: 0, limit: 3 });
-        held.remove(0);
-        held.push(trainer.receive(0, TIMEOUT).unwrap());
-        assert!(held.windows(2).all(|pair| pair[0].step() + 1 == pair[1].step()));
+    let mut held = Vec::new();
+    for _ in 0..trainer.specification().batches_held {
+        held.push(step(&mut trainer, 0));
+    }
+    assert_error!(try_step(&mut trainer, 0), ServiceError::TooManyBatchesHeld { group: 0, limit: 3 });
+    held.remove(0);
+    held.push(trainer.receive(0, TIMEOUT).unwrap());
+    assert!(held.windows(2).all(|pair| pair[0].step() + 1 == pair[1].step()));
 
-        stop.store(true, Ordering::Relaxed);
-        let summary = running.join().unwrap();
-        assert_eq!((summary.batches, summary.env_steps, summary.rejected), (5, 8, 1));
-    });
+    engine.stop();
+    let summary = engine.join().unwrap();
+    assert_eq!((summary.batches, summary.env_steps, summary.rejected), (5, 8, 1));
 }
 
 #[test]

@@ -179,10 +179,10 @@ fn serve_restarts_an_engine_whose_directory_is_removed() {
 #[test]
 fn an_engine_ends_with_an_error_when_its_directory_is_removed() {
     let place = Place::new();
-    let mut engine = Engine::new(memory_gym(), &place.engine_config("gym", 1, 1)).unwrap();
+    let engine = Engine::new(memory_gym(), &place.engine_config("gym", 1, 1)).unwrap();
     fs::remove_dir_all(place.root()).unwrap();
     let start = Instant::now();
-    assert_error!(engine.run(&AtomicBool::new(false)), ServiceError::RootRemoved { .. });
+    assert_error!(engine.spawn().unwrap().join(), ServiceError::RootRemoved { .. });
     assert!(start.elapsed() < Duration::from_secs(2));
 }
 

@@ -1,7 +1,5 @@
 //! Groups of an engine that step at the same time, and trainers that use a thread for each.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{
@@ -156,11 +154,8 @@ fn groups_that_step_at_the_same_time_play_the_same_bytes() {
     let namespace = place.namespace().clone();
     let config = EngineConfig::new("gym", pool, 4).namespace(namespace).groups(4).checkpoint(checkpoint);
     let mut twins = Player::new(&PoolConfig::new(ID, 4 * NUM_ENVS));
-    let stop = AtomicBool::new(false);
+    let engine = Engine::new(memory_gym(), &config).unwrap().spawn().unwrap();
     let saved: Vec<Vec<u64>> = std::thread::scope(|scope| {
-        let mut engine = Engine::new(memory_gym(), &config).unwrap();
-        let stop = &stop;
-        let running = scope.spawn(move || engine.run(stop).map(|_| engine.steps()).unwrap());
         let trainer = place.trainer("gym").unwrap();
         let played = trainer.into_groups().into_iter().map(|mut group| {
             scope.spawn(move || {
@@ -192,10 +187,10 @@ fn groups_that_step_at_the_same_time_play_the_same_bytes() {
             let frames: Vec<u8> = played.iter().flat_map(|(frames, _)| frames[step].clone()).collect();
             assert!(frames == twins.batch().observation(), "step {step}");
         }
-        stop.store(true, Ordering::Relaxed);
-        assert_eq!(running.join().unwrap(), [STEPS as u64; 4]);
         played.into_iter().flat_map(|(_, saved)| saved).collect()
     });
+    engine.stop();
+    assert_eq!(engine.join().unwrap().batches, 4 * STEPS as u64);
     assert!(saved.iter().all(|steps| steps.len() == 4));
     assert!(file.exists());
 }

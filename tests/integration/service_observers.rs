@@ -1,6 +1,5 @@
 //! Observers that wait: they sleep until a batch comes, and cannot hold up the engine or each other.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
@@ -98,11 +97,9 @@ fn a_batch_wakes_an_observer_at_once() {
 fn dead_and_stopped_observers_hold_up_nobody() {
     let place = Place::new();
     let config = place.engine_config("gym", 2, 2).observers(16);
-    let stop = AtomicBool::new(false);
+    let engine = Engine::new(memory_gym(), &config).unwrap().spawn().unwrap();
     std::thread::scope(|scope| {
-        let mut engine = Engine::new(memory_gym(), &config).unwrap();
-        let (stop, place) = (&stop, &place);
-        let running = scope.spawn(move || engine.run(stop).unwrap());
+        let place = &place;
         let mut others: Vec<_> = (0..6).map(|_| place.role("observer gym")).collect();
         wait_until("six observers", || {
             let status = EngineStatus::of(place.namespace(), "gym");
@@ -127,9 +124,9 @@ fn dead_and_stopped_observers_hold_up_nobody() {
         }
         assert!(seen.join().unwrap() > 0);
         drop(others);
-        stop.store(true, Ordering::Relaxed);
-        assert!(running.join().unwrap().batches > 1500);
     });
+    engine.stop();
+    assert!(engine.join().unwrap().batches > 1500);
 }
 
 /// The trainer's speed beside observers that take every batch they can, in turn with that without observers.
@@ -145,39 +142,32 @@ fn measure_the_price_of_observers() {
     let pool = PoolConfig::new(ID, 64);
     let namespace = place.namespace().clone();
     let config = EngineConfig::new("gym", pool, 0).namespace(namespace).observers(16);
-    let stop = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        let mut engine = Engine::new(memory_gym(), &config).unwrap();
-        let stop = &stop;
-        let running = scope.spawn(move || engine.run(stop).unwrap());
-        let connect = place.connect_config("gym").timeout(TIMEOUT);
-        let mut trainer = Trainer::connect(&connect).unwrap();
-        drop(reset(&mut trainer, 0));
-        let rate = |trainer: &mut Trainer| {
-            let (start, mut steps) = (Instant::now(), 0.0);
-            while start.elapsed() < Duration::from_secs(1) {
-                drop(step(trainer, 0));
-                steps += 1.0;
-            }
-            steps / start.elapsed().as_secs_f64()
-        };
-        for count in [1, 4, 16] {
-            let mut ratios: Vec<f64> = (0..ROUNDS)
-                .map(|_| {
-                    let alone = rate(&mut trainer);
-                    let observers: Vec<_> = (0..count).map(|_| place.role("observer gym")).collect();
-                    let connected = || EngineStatus::of(place.namespace(), "gym").unwrap().groups[0].observers.len();
-                    wait_until("observers", || connected() == count);
-                    let observed = rate(&mut trainer);
-                    drop(observers);
-                    wait_until("no observers", || connected() == 0);
-                    observed / alone
-                })
-                .collect();
-            ratios.sort_by(f64::total_cmp);
-            println!("{count} observers: {:.3} ({:.3} to {:.3})", ratios[ROUNDS / 2], ratios[0], ratios[ROUNDS - 1]);
+    let _engine = Engine::new(memory_gym(), &config).unwrap().spawn().unwrap();
+    let connect = place.connect_config("gym").timeout(TIMEOUT);
+    let mut trainer = Trainer::connect(&connect).unwrap();
+    drop(reset(&mut trainer, 0));
+    let rate = |trainer: &mut Trainer| {
+        let (start, mut steps) = (Instant::now(), 0.0);
+        while start.elapsed() < Duration::from_secs(1) {
+            drop(step(trainer, 0));
+            steps += 1.0;
         }
-        stop.store(true, Ordering::Relaxed);
-        running.join().unwrap();
-    });
+        steps / start.elapsed().as_secs_f64()
+    };
+    for count in [1, 4, 16] {
+        let mut ratios: Vec<f64> = (0..ROUNDS)
+            .map(|_| {
+                let alone = rate(&mut trainer);
+                let observers: Vec<_> = (0..count).map(|_| place.role("observer gym")).collect();
+                let connected = || EngineStatus::of(place.namespace(), "gym").unwrap().groups[0].observers.len();
+                wait_until("observers", || connected() == count);
+                let observed = rate(&mut trainer);
+                drop(observers);
+                wait_until("no observers", || connected() == 0);
+                observed / alone
+            })
+            .collect();
+        ratios.sort_by(f64::total_cmp);
+        println!("{count} observers: {:.3} ({:.3} to {:.3})", ratios[ROUNDS / 2], ratios[0], ratios[ROUNDS - 1]);
+    }
 }

@@ -1,7 +1,6 @@
 //! Tests that a paused observer costs the engine nothing, keeps its slot, and gets the newest batch when it resumes.
 
 use std::collections::HashSet;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use crate::support::place::Place;
@@ -78,34 +77,29 @@ fn a_lease_is_valid_while_its_observer_is_paused() {
 fn a_paused_observer_keeps_its_slot() {
     let place = Place::new();
     let config = place.engine_config("gym", NUM_ENVS, 1).observers(2);
-    let mut engine = Engine::new(memory_gym(), &config).unwrap();
-    let stop = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| engine.run(&stop).unwrap());
-        let connect = || Observer::connect(&place.connect_config("gym"), 0);
-        let refused = |observer: Result<Observer, ServiceError>| {
-            matches!(observer, Err(ServiceError::TooManyObservers { limit: 2, .. }))
-        };
-        let (mut first, mut second) = (connect().unwrap(), connect().unwrap());
-        for paused in [1, 2] {
-            first.pause();
-            if paused == 2 {
-                second.pause();
-            }
-            assert!(refused(connect()), "{paused} paused");
+    let _engine = Engine::new(memory_gym(), &config).unwrap().spawn().unwrap();
+    let connect = || Observer::connect(&place.connect_config("gym"), 0);
+    let refused = |observer: Result<Observer, ServiceError>| {
+        matches!(observer, Err(ServiceError::TooManyObservers { limit: 2, .. }))
+    };
+    let (mut first, mut second) = (connect().unwrap(), connect().unwrap());
+    for paused in [1, 2] {
+        first.pause();
+        if paused == 2 {
+            second.pause();
         }
-        let status = EngineStatus::of(place.namespace(), "gym").unwrap();
-        assert_eq!(status.groups[0].observers.len(), 2);
-        drop(second);
-        let third = connect().unwrap();
-        assert!(refused(connect()));
-        let mut trainer = started(&place);
-        assert!(first.newest().unwrap().is_none());
-        let sent = step(&mut trainer, 0).step();
-        assert_eq!(first.newest().unwrap().map(|lease| lease.step()), Some(sent));
-        drop(third);
-        stop.store(true, Ordering::Relaxed);
-    });
+        assert!(refused(connect()), "{paused} paused");
+    }
+    let status = EngineStatus::of(place.namespace(), "gym").unwrap();
+    assert_eq!(status.groups[0].observers.len(), 2);
+    drop(second);
+    let third = connect().unwrap();
+    assert!(refused(connect()));
+    let mut trainer = started(&place);
+    assert!(first.newest().unwrap().is_none());
+    let sent = step(&mut trainer, 0).step();
+    assert_eq!(first.newest().unwrap().map(|lease| lease.step()), Some(sent));
+    drop(third);
 }
 
 #[test]

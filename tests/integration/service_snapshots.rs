@@ -1,6 +1,5 @@
 //! Tests that snapshots through the service equal those of a pool in this process and can be restored in both.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use crate::support::foreign::{Foreign, RequestHeader};
@@ -139,21 +138,16 @@ fn a_snapshot_with_a_thousand_spotlights_fits_into_a_message() {
     let options = ResetOptions::Shared(options.as_object().unwrap().clone());
     let pool = PoolConfig::new("SearingSpotlights-v0", 1).options(options).features(true).frames(None);
     let config = EngineConfig::new("gym", pool, 1);
-    let mut engine = Engine::new(memory_gym(), &config.namespace(place.namespace().clone())).unwrap();
-    let stop = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| engine.run(&stop).unwrap());
-        let mut trainer = place.trainer("gym").unwrap();
-        reset(&mut trainer, 0);
-        let mut longest = 0;
-        for _ in 0..100 {
-            trainer.send(0, &[1, 2]).unwrap();
-            trainer.receive(0, TIMEOUT).unwrap();
-            let snapshot = trainer.snapshot(0, 0, TIMEOUT).unwrap();
-            trainer.restore(0, 0, &snapshot, TIMEOUT).unwrap();
-            longest = longest.max(snapshot.len());
-        }
-        assert!((80_000..SNAPSHOT_BYTES).contains(&longest), "{longest}");
-        stop.store(true, Ordering::Relaxed);
-    });
+    let _engine = Engine::new(memory_gym(), &config.namespace(place.namespace().clone())).unwrap().spawn().unwrap();
+    let mut trainer = place.trainer("gym").unwrap();
+    reset(&mut trainer, 0);
+    let mut longest = 0;
+    for _ in 0..100 {
+        trainer.send(0, &[1, 2]).unwrap();
+        trainer.receive(0, TIMEOUT).unwrap();
+        let snapshot = trainer.snapshot(0, 0, TIMEOUT).unwrap();
+        trainer.restore(0, 0, &snapshot, TIMEOUT).unwrap();
+        longest = longest.max(snapshot.len());
+    }
+    assert!((80_000..SNAPSHOT_BYTES).contains(&longest), "{longest}");
 }

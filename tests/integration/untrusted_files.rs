@@ -87,17 +87,14 @@ fn a_checkpoint_replaces_a_planted_link_and_does_not_follow_it() {
     let checkpoint = Some(CheckpointConfig::new(&path));
     let config = EngineConfig::new("gym", PoolConfig::new("MysteryPath-Grid-v0", 1), 1);
     let config = config.checkpoint(checkpoint).namespace(place.namespace().clone());
-    let mut engine = Engine::new(memory_gym(), &config).unwrap();
+    let engine = Engine::new(memory_gym(), &config).unwrap();
     plant();
-    let stop = std::sync::atomic::AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        let running = scope.spawn(|| engine.run(&stop).map(drop));
-        let mut trainer = place.trainer("gym").unwrap();
-        trainer.reset(0, ResetRequest::All).unwrap();
-        trainer.receive(0, crate::support::process::TIMEOUT).unwrap();
-        stop.store(true, std::sync::atomic::Ordering::Relaxed);
-        running.join().unwrap().unwrap();
-    });
+    let engine = engine.spawn().unwrap();
+    let mut trainer = place.trainer("gym").unwrap();
+    trainer.reset(0, ResetRequest::All).unwrap();
+    trainer.receive(0, crate::support::process::TIMEOUT).unwrap();
+    engine.stop();
+    engine.join().unwrap();
     assert_eq!(std::fs::read_to_string(&other).unwrap(), "mine");
     assert!(std::fs::symlink_metadata(&path).unwrap().is_file());
 }

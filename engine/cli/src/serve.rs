@@ -18,6 +18,9 @@ use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_val
 use super::output::{grouped, print, print_error};
 use super::stop::{self, Watchdog};
 
+/// How often the command checks whether the engine has ended.
+const CHECK_INTERVAL: Duration = Duration::from_millis(100);
+
 /// The arguments, or groups of arguments, that make up a configuration.
 const CONFIGURATION: [&str; 12] = [
     "EnvironmentArgs",
@@ -189,13 +192,15 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     }
     let summary = loop {
         let watchdog = watch(&engine, &config, stop)?;
-        let finished = engine.run(stop);
+        let running = engine.spawn()?;
+        while !running.is_finished() && !stop::wait(stop, CHECK_INTERVAL) {}
+        running.stop();
+        let finished = running.join();
         drop(watchdog);
         match finished {
             // The episodes are lost, but a trainer can reconnect without user action.
             Err(error @ ServiceError::RootRemoved { .. }) => {
                 print_error(&error);
-                drop(engine);
                 if let Some(checkpoint) = &mut config.checkpoint {
                     checkpoint.resume = true;
                 }

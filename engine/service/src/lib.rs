@@ -157,7 +157,7 @@ pub use client::status::{EngineMonitor, EngineProcesses, EngineStatus, GroupStat
 pub use client::trainer::Trainer;
 pub use client::trainer_group::TrainerGroup;
 pub use engine::config::{CheckpointConfig, EngineConfig};
-pub use engine::handle::EngineHandle;
+pub use engine::handle::{EngineHandle, EngineStopper};
 pub use engine::serving::Engine;
 pub use engine::status_writer::EngineSummary;
 pub use error::{CHECKPOINT_VERSION, CheckpointError, EngineActivity, ErrorKind, Rejection, ServiceError};

@@ -5,7 +5,7 @@ use std::fs;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command as Process;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use clap::{Args, Command, FromArgMatches};
@@ -225,24 +225,15 @@ fn a_run_with_an_engine_is_the_same_as_in_process() {
     let pool = pool_config(memory_gym(), &settings).unwrap();
     let config = EngineConfig::new("learn", pool, 1).groups(2).namespace(namespace.clone());
     let wrong = config.clone().service("wrong".to_owned()).pool(config.pool.clone().features(false));
-    let (mut engine, _wrong) =
-        (Engine::new(memory_gym(), &config).unwrap(), Engine::new(memory_gym(), &wrong).unwrap());
-    let stop = AtomicBool::new(false);
-    let run = std::thread::scope(|scope| {
-        let running = scope.spawn(|| engine.run(&stop));
-        let connect = ConnectConfig::new("learn").namespace(namespace).timeout(Duration::from_secs(10));
-        let other = Trainer::connect(&connect.clone().service("wrong".to_owned())).unwrap();
-        let error = Environments::served(memory_gym(), &settings, other).err().unwrap().to_string();
-        assert!(error.contains("same_step and 0 features"), "{error}");
-        let connected = Trainer::connect(&connect);
-        let run = connected.map_err(Error::from).and_then(|trainer| {
-            let environments = |settings: &Settings| Environments::served(memory_gym(), settings, trainer);
-            learn(&settings, environments, &AtomicBool::new(false))
-        });
-        stop.store(true, Ordering::Relaxed);
-        running.join().unwrap().unwrap();
-        run.unwrap()
-    });
+    let _engine = Engine::new(memory_gym(), &config).unwrap().spawn().unwrap();
+    let _wrong = Engine::new(memory_gym(), &wrong).unwrap();
+    let connect = ConnectConfig::new("learn").namespace(namespace).timeout(Duration::from_secs(10));
+    let other = Trainer::connect(&connect.clone().service("wrong".to_owned())).unwrap();
+    let error = Environments::served(memory_gym(), &settings, other).err().unwrap().to_string();
+    assert!(error.contains("same_step and 0 features"), "{error}");
+    let trainer = Trainer::connect(&connect).unwrap();
+    let environments = |settings: &Settings| Environments::served(memory_gym(), settings, trainer);
+    let run = learn(&settings, environments, &AtomicBool::new(false)).unwrap();
     assert_same(&expected, &run);
 }
 

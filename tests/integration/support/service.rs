@@ -4,8 +4,6 @@
 
 use std::io::Read;
 use std::process::{Command, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::faulty_environments;
 use endless_gym::memory_gym;
@@ -109,14 +107,12 @@ pub fn play_role() {
         ["engine", service, num_envs, groups] => {
             let (num_envs, groups) = (num_envs.parse().unwrap(), groups.parse().unwrap());
             let config = engine_config(&Namespace::default(), service, num_envs, groups);
-            let mut engine = Engine::new(memory_gym(), &config).unwrap_or_else(|e| panic!("{e}: {e:?}"));
-            engine.run(&stop_at_end_of_input()).unwrap();
+            serve(Engine::new(memory_gym(), &config).unwrap_or_else(|e| panic!("{e}: {e:?}")));
         }
         ["meeting", num_envs, groups, threads] => {
             let (pool, groups) = (meeting::pool(num_envs.parse().unwrap()), groups.parse().unwrap());
             let config = EngineConfig::new("meeting", pool, threads.parse().unwrap()).groups(groups);
-            let mut engine = Engine::new(&meeting::registry(), &config).unwrap();
-            engine.run(&stop_at_end_of_input()).unwrap();
+            serve(Engine::new(&meeting::registry(), &config).unwrap());
         }
         ["trainer", service] => {
             let mut trainer = connect(service);
@@ -147,13 +143,13 @@ pub fn play_role() {
     }
 }
 
-/// A flag that is set when the parent process closes standard input.
-fn stop_at_end_of_input() -> Arc<AtomicBool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
+/// Serves until the parent process closes standard input.
+fn serve(engine: Engine) {
+    let engine = engine.spawn().unwrap();
+    let stopper = engine.stopper();
     std::thread::spawn(move || {
         let _ = std::io::stdin().read_to_end(&mut Vec::new());
-        flag.store(true, Ordering::Relaxed);
+        stopper.stop();
     });
-    stop
+    engine.join().unwrap();
 }

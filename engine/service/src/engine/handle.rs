@@ -13,8 +13,19 @@ use crate::error::ServiceError;
 /// An engine that serves in threads of this process. Dropping it stops the engine and waits until it has ended.
 #[derive(Debug)]
 pub struct EngineHandle {
-    stop: Arc<AtomicBool>,
+    stopper: EngineStopper,
     thread: Option<JoinHandle<Result<EngineSummary, ServiceError>>>,
+}
+
+/// Asks an engine to stop, for example when a signal comes.
+#[derive(Clone, Debug)]
+pub struct EngineStopper(Arc<AtomicBool>);
+
+impl EngineStopper {
+    /// As [`EngineHandle::stop`].
+    pub fn stop(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
 }
 
 impl Engine {
@@ -24,18 +35,23 @@ impl Engine {
     ///
     /// [`ServiceError::Pool`] if a thread cannot be started.
     pub fn spawn(mut self) -> Result<EngineHandle, ServiceError> {
-        let stop = Arc::new(AtomicBool::new(false));
-        let flag = Arc::clone(&stop);
-        let thread = Builder::new().name("endless-engine".to_owned()).spawn(move || self.run(&flag));
+        let stopper = EngineStopper(Arc::default());
+        let stop = Arc::clone(&stopper.0);
+        let thread = Builder::new().name("endless-engine".to_owned()).spawn(move || self.run(&stop));
         let thread = thread.map_err(|source| PoolError::Threads { count: 1, source })?;
-        Ok(EngineHandle { stop, thread: Some(thread) })
+        Ok(EngineHandle { stopper, thread: Some(thread) })
     }
 }
 
 impl EngineHandle {
     /// Asks the engine to stop, and returns at once. It ends within 0.2 s, or when the last checkpoint is saved.
     pub fn stop(&self) {
-        self.stop.store(true, Ordering::Relaxed);
+        self.stopper.stop();
+    }
+
+    /// Stops the engine from another thread while this one waits in [`join`](Self::join).
+    pub fn stopper(&self) -> EngineStopper {
+        self.stopper.clone()
     }
 
     /// Whether the engine has ended, because of [`stop`](Self::stop) or an error.
@@ -47,7 +63,11 @@ impl EngineHandle {
     ///
     /// # Errors
     ///
-    /// Those of [`Engine::run`].
+    /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, since no trainer can find the
+    /// engine any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue.
+    /// [`ServiceError::Panic`] if an environment panics; the trainer is told as well. [`ServiceError::Checkpoint`] if the last
+    /// checkpoint cannot be saved; earlier failures are logged and tried again later. A trainer's faults are not errors: its
+    /// requests are rejected.
     ///
     /// # Panics
     ///

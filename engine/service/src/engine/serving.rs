@@ -159,8 +159,8 @@ impl Drop for SetOnDrop<'_> {
 }
 
 impl Engine {
-    /// Creates the environments and takes the engine's name. Trainers can connect from now on, and are served by
-    /// [`run`](Engine::run).
+    /// Creates the environments and takes the engine's name. Trainers can connect from now on, and are served after
+    /// [`spawn`](Engine::spawn).
     ///
     /// # Errors
     ///
@@ -280,17 +280,8 @@ impl Engine {
         (0..self.groups.len()).map(|group| self.status.step(group)).collect()
     }
 
-    /// Serves requests in this thread until `stop` is set, for programs whose signal handlers set a flag; see also
-    /// [`spawn`](Engine::spawn). Returns within 0.2 s after that, or when the last checkpoint is saved.
-    ///
-    /// # Errors
-    ///
-    /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, since no trainer can
-    /// find the engine any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine
-    /// cannot continue. [`ServiceError::Panic`] if an environment panics; the trainer is told as well.
-    /// [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; earlier failures are
-    /// logged and tried again later. A trainer's faults are not errors: its requests are rejected.
-    pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
+    /// Serves requests in this thread and others until `stop` is set.
+    pub(super) fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (this, ended) = (&*self, AtomicBool::new(false));
         let serve = |server| {
             // A thread that ends, even by a panic, ends the others.
