@@ -312,7 +312,8 @@ impl Engine {
 
     /// The loop of a server, until `stop` returns true.
     fn serve(&self, number: usize, stop: &dyn Fn() -> bool) -> Result<(), ServiceError> {
-        let Server { groups: own, threads, is_busy } = &self.servers[number];
+        let server = &self.servers[number];
+        let Server { groups: own, threads, is_busy } = server;
         let (mut last_request, mut next) = (Instant::now(), own.start);
         let mut chores = (number == 0).then(Chores::new);
         while !stop() {
@@ -330,15 +331,11 @@ impl Engine {
             })?;
             match taken {
                 Some(Taken { number, mut group, request }) => {
-                    is_busy.store(true, Ordering::SeqCst);
                     let is_own = own.contains(&number);
                     if is_own {
                         next = number + 1;
                     }
-                    // Another server can take them, now that this one is busy.
-                    if own.len() > 1 && own.clone().any(|group| self.groups.has_request(group)) {
-                        self.groups.wake_any();
-                    }
+                    self.set_busy(server, usize::from(is_own));
                     group.set_threads(threads);
                     self.answer(Taken { number, group, request })?;
                     if !is_own {
@@ -358,14 +355,23 @@ impl Engine {
                     }
                 }
             }
-            if chores.is_some() {
+            if chores.is_some() && (self.pictures.is_some() || self.checkpointer.is_some()) {
                 // Drawing and saving wait for other groups, and for the disk.
-                is_busy.store(true, Ordering::SeqCst);
+                self.set_busy(server, 0);
                 self.look_after_files();
                 is_busy.store(false, Ordering::SeqCst);
             }
         }
         Ok(())
+    }
+
+    /// Lets other servers take the requests to this one's groups, of which it has taken that many; also requests that came before.
+    fn set_busy(&self, server: &Server, taken: usize) {
+        server.is_busy.store(true, Ordering::SeqCst);
+        let has_others = self.servers.len() > 1 && server.groups.len() > taken;
+        if has_others && server.groups.clone().any(|group| self.groups.has_request(group)) {
+            self.groups.wake_any();
+        }
     }
 
     /// Draws for viewers and saves checkpoints when they are due.
