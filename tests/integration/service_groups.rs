@@ -123,12 +123,39 @@ fn a_trainer_steps_each_group_in_a_thread() {
     let mut groups: Vec<_> = threads.into_iter().map(|thread| thread.join().unwrap()).collect();
     groups.reverse();
     let last = groups.pop().unwrap();
-    let mut groups = Trainer::from_groups(groups).map(drop).unwrap_err();
+    let error = Trainer::from_groups(groups).map(drop).unwrap_err();
+    assert!(error.to_string().contains("one trainer"), "{error}");
+    let mut groups = error.groups;
     groups.push(last);
-    let mut trainer = Trainer::from_groups(groups).map_err(drop).unwrap();
+    let mut trainer = Trainer::from_groups(groups).unwrap();
     assert!(!trainer.reconnect(TIMEOUT).unwrap().restarted);
     assert_error!(trainer.group(GROUPS), ServiceError::NoSuchGroup { given: GROUPS, .. });
     engine.end();
+}
+
+#[test]
+fn groups_of_two_trainers_are_an_error_and_sorted_groups_keep_their_numbers() {
+    let place = Place::new();
+    let start = |service, groups| {
+        let engine = Engine::new(memory_gym(), &place.engine_config(service, 1, groups)).unwrap().spawn().unwrap();
+        (engine, place.trainer(service).unwrap())
+    };
+    let ((_first, mut many), (second, mut one)) = (start("many", 2), start("one", 1));
+    many.reset(1, ResetRequest::All).unwrap();
+    many.receive(1, TIMEOUT).unwrap();
+    many.groups().reverse();
+    let steps: Vec<_> = many.reconnect(TIMEOUT).unwrap().groups.iter().map(|group| group.step).collect();
+    assert_eq!(steps, [Some(0), Some(1)]);
+
+    std::mem::swap(&mut many.groups()[1], &mut one.groups()[0]);
+    drop(second);
+    assert_error!(one.reconnect(TIMEOUT), ServiceError::MixedGroups);
+    assert_error!(many.reconnect(TIMEOUT), ServiceError::MixedGroups);
+    assert_error!(many.receive_any(TIMEOUT), ServiceError::MixedGroups);
+    std::mem::swap(&mut many.groups()[1], &mut one.groups()[0]);
+    let _third = Engine::new(memory_gym(), &place.engine_config("one", 1, 1)).unwrap().spawn().unwrap();
+    assert!(one.reconnect(TIMEOUT).unwrap().restarted);
+    assert!(!many.reconnect(TIMEOUT).unwrap().restarted);
 }
 
 #[test]

@@ -209,7 +209,7 @@ impl Connection {
             };
             let (found, groups) = match Trainer::from_groups(groups) {
                 Ok(mut trainer) => (trainer.reconnect(slice).map(Some), trainer.into_groups()),
-                Err(groups) => (Ok(None), groups),
+                Err(error) => (Ok(None), error.groups),
             };
             locked.iter_mut().zip(groups).for_each(|(locked, group)| **locked = Some(group));
             found

@@ -218,6 +218,11 @@ pub enum ServiceError {
         /// Number of groups of the engine.
         groups: usize,
     },
+    /// The groups are not those of one trainer.
+    #[error(
+        "the groups must belong to one trainer, and be all of its groups where a trainer is made of them or reconnects"
+    )]
+    MixedGroups,
     /// The number of actions is wrong, or an action is out of range. No environment has been stepped.
     #[error(transparent)]
     Action(#[from] ActionError),
@@ -394,6 +399,7 @@ impl ServiceError {
             | E::OutOfRange { .. }
             | E::InvalidTimeout { .. }
             | E::NoSuchGroup { .. }
+            | E::MixedGroups
             | E::Action(_)
             | E::ResetCount { .. }
             | E::OptionsTooLong { .. }

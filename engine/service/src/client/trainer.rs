@@ -1,5 +1,6 @@
 //! The trainer: sends actions to an engine and receives batches, which it reads in place.
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,7 +11,7 @@ use crate::client::connect::ConnectConfig;
 use crate::client::connection::EngineConnection;
 use crate::client::lease::BatchLease;
 use crate::client::requests::{GroupReconnection, LastRequest, Reconnection};
-use crate::client::trainer_group::{Shared, TrainerGroup};
+use crate::client::trainer_group::{self, Shared, TrainerGroup};
 use crate::error::ServiceError;
 use crate::namespace::fork_guard::ForkGuard;
 use crate::protocol::specification::ServiceSpecification;
@@ -44,6 +45,28 @@ use crate::protocol::specification::ServiceSpecification;
 pub struct Trainer {
     /// All groups of the engine, in the order of their numbers.
     groups: Vec<TrainerGroup>,
+}
+
+/// The groups from which [`Trainer::from_groups`](Trainer::from_groups) could not make a trainer.
+#[derive(Debug)]
+#[non_exhaustive]
+pub struct GroupsError {
+    /// The groups that were given.
+    pub groups: Vec<TrainerGroup>,
+}
+
+impl fmt::Display for GroupsError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        ServiceError::MixedGroups.fmt(f)
+    }
+}
+
+impl std::error::Error for GroupsError {}
+
+impl From<GroupsError> for ServiceError {
+    fn from(_: GroupsError) -> Self {
+        ServiceError::MixedGroups
+    }
 }
 
 impl Trainer {
@@ -90,12 +113,9 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// `groups` itself if they are not all groups that [`into_groups`](Trainer::into_groups) returned, in any order.
-    pub fn from_groups(mut groups: Vec<TrainerGroup>) -> Result<Self, Vec<TrainerGroup>> {
-        groups.sort_by_key(TrainerGroup::number);
-        let count = groups.first().map_or(usize::MAX, |group| group.specification().groups);
-        let is_same = |group: &TrainerGroup| Arc::ptr_eq(&group.shared, &groups[0].shared);
-        if groups.len() == count && groups.iter().all(is_same) { Ok(Trainer { groups }) } else { Err(groups) }
+    /// [`GroupsError`], with the groups, if they are not all that [`into_groups`](Trainer::into_groups) returned, in any order.
+    pub fn from_groups(mut groups: Vec<TrainerGroup>) -> Result<Self, GroupsError> {
+        if trainer_group::sort(&mut groups) { Ok(Trainer { groups }) } else { Err(GroupsError { groups }) }
     }
 
     fn shared(&self) -> &Arc<Shared> {
@@ -112,9 +132,12 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::SpecificationChanged`] if the new engine serves different environments, and the errors of
-    /// [`connect`](Trainer::connect).
+    /// [`ServiceError::SpecificationChanged`] if the new engine serves different environments, [`ServiceError::MixedGroups`] if
+    /// groups were exchanged with another trainer's, and the errors of [`connect`](Trainer::connect).
     pub fn reconnect(&mut self, timeout: Duration) -> Result<Reconnection, ServiceError> {
+        if !trainer_group::sort(&mut self.groups) {
+            return Err(ServiceError::MixedGroups);
+        }
         let lost = Arc::clone(self.shared());
         let restarted = !lost.connection.is_engine_alive();
         let mut last: Vec<_> = self.groups.iter().map(|group| (None, group.pending.last())).collect();

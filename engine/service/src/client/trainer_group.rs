@@ -2,6 +2,7 @@
 
 use std::borrow::{Borrow, BorrowMut};
 use std::collections::BTreeSet;
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -60,24 +61,24 @@ impl Shared {
 /// use std::time::Duration;
 ///
 /// use endless_gym_core::pool::ResetRequest;
-/// use endless_gym_service::{ConnectConfig, ServiceError, Trainer};
+/// use endless_gym_service::{ConnectConfig, ServiceError, Trainer, TrainerGroup};
 ///
 /// let timeout = Duration::from_secs(10);
 /// let mut trainer = Trainer::connect(&ConnectConfig::new("endless").timeout(timeout))?;
-/// std::thread::scope(|scope| {
-///     for group in trainer.groups() {
-///         scope.spawn(move || {
-///             group.reset(ResetRequest::All)?;
-///             for _ in 0..1000 {
-///                 let lease = group.receive(timeout)?;
-///                 println!("group {} step {}", lease.group(), lease.step());
-///                 group.send_with(|actions| actions.fill(0))?;
-///             }
-///             Ok::<(), ServiceError>(())
-///         });
+/// let play = |group: &mut TrainerGroup| {
+///     group.reset(ResetRequest::All)?;
+///     for _ in 0..1000 {
+///         let lease = group.receive(timeout)?;
+///         println!("group {} step {}", lease.group(), lease.step());
+///         group.send_with(|actions| actions.fill(0))?;
 ///     }
-/// });
-/// # Ok::<(), ServiceError>(())
+///     Ok::<(), ServiceError>(())
+/// };
+/// std::thread::scope(|scope| {
+///     let threads: Vec<_> = trainer.groups().iter_mut().map(|group| scope.spawn(move || play(group))).collect();
+///     threads.into_iter().try_for_each(|thread| thread.join().expect("no panic"))
+/// })
+/// # ?; Ok::<(), ServiceError>(())
 /// ```
 pub struct TrainerGroup {
     pub(super) number: usize,
@@ -87,6 +88,23 @@ pub struct TrainerGroup {
     /// When the last request was sent.
     sent: Instant,
     pub(super) shared: Arc<Shared>,
+}
+
+impl fmt::Debug for TrainerGroup {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let service = &self.shared.config.service;
+        f.debug_struct("TrainerGroup").field("service", service).field("number", &self.number).finish_non_exhaustive()
+    }
+}
+
+/// Sorts groups by their numbers, and returns whether they are all groups of one trainer.
+pub(super) fn sort(groups: &mut [TrainerGroup]) -> bool {
+    groups.sort_by_key(TrainerGroup::number);
+    groups.first().is_some_and(|first| first.specification().groups == groups.len()) && are_of_one_trainer(groups)
+}
+
+fn are_of_one_trainer(groups: &[impl Borrow<TrainerGroup>]) -> bool {
+    groups.iter().all(|group| Arc::ptr_eq(&group.borrow().shared, &groups[0].borrow().shared))
 }
 
 impl TrainerGroup {
@@ -204,7 +222,7 @@ impl TrainerGroup {
     ///
     /// # Errors
     ///
-    /// Those of [`Trainer::receive_any`](crate::Trainer::receive_any).
+    /// [`ServiceError::MixedGroups`], and those of [`Trainer::receive_any`](crate::Trainer::receive_any).
     pub fn receive_any(groups: &mut [impl BorrowMut<Self>], timeout: Duration) -> Result<BatchLease, ServiceError> {
         let response = receive_response(groups, true, timeout)?;
         let service = response.service().to_owned();
@@ -358,13 +376,16 @@ impl TrainerGroup {
     }
 }
 
-/// The first response to a pending request of `groups`, of one trainer: of requests that return batches, or (`!batches`) of the
+/// The first response to a pending request of `groups`: of requests that return batches, or (`!batches`) of the
 /// others.
 fn receive_response<G: BorrowMut<TrainerGroup>>(
     groups: &mut [G],
     batches: bool,
     timeout: Duration,
 ) -> Result<Response, ServiceError> {
+    if !are_of_one_trainer(groups) {
+        return Err(ServiceError::MixedGroups);
+    }
     let is_pending = |group: &&TrainerGroup| group.pending.number(batches).is_some();
     let waiting = || groups.iter().map(Borrow::borrow).filter(is_pending);
     let Some(shared) = waiting().next().map(|group| Arc::clone(&group.shared)) else {
