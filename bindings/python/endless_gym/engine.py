@@ -164,7 +164,8 @@ def serve(
         autoreset: As for `make_vec`.
         observation: As for `make_vec`.
         frames: As for `make_vec`.
-        batches_held: Batches of a group whose arrays may be referenced at the same time, 1 to 16.
+        batches_held: Batches of a group whose arrays may be referenced at the same time, 1 to 16, less what `pin_memory` and
+            `episode_info` take where the engine would lend more than 16.
         checkpoint: File to which the engine saves all environments when it is closed or ended by a signal, and when
             `EndlessVectorEnv.checkpoint` is called.
         checkpoint_every: Seconds between further saves while the engine runs; `None` for none.
@@ -172,14 +173,14 @@ def serve(
             existing file is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
-        pin_memory: As for `connect`; the engine lends one extra batch for it.
+        pin_memory: As for `connect`; the engine lends one extra batch for it, up to 16 in all.
         independent_episodes: As for `make_vec`.
         first_env: As for `make_vec`.
         total_envs: As for `make_vec`.
         render_mode: As for `make_vec`.
         view: As for `make_vec`.
         episode_options: As for `connect`.
-        episode_info: As for `connect`; the engine lends one extra batch for it.
+        episode_info: As for `connect`; the engine lends one extra batch for it, up to 16 in all.
 
     Raises:
         TypeError: A number is not an integer.
