@@ -1,8 +1,10 @@
 //! What operators of `endless serve` rely on, with real processes: checkpoints, status, metrics, logs, and its end.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::process::Stdio;
+use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
 use crate::support::place::Place;
@@ -32,6 +34,48 @@ const ENVIRONMENTS: [&str; 7] = [
 fn serve(place: &Place, more: &[&str]) -> Process {
     let arguments = [&["serve"], &ENVIRONMENTS[..], more].concat();
     Process::spawn(place.endless(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()))
+}
+
+/// The CPUs on which each thread of a process may run, by the thread's name.
+fn allowed_cpus(process: u32) -> BTreeMap<String, String> {
+    let threads = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
+    let allowed = threads.map(|thread| {
+        let status = std::fs::read_to_string(thread.unwrap().path().join("status")).unwrap();
+        let field = |name| status.lines().find_map(|line| line.strip_prefix(name)).unwrap().trim().to_owned();
+        (field("Name:"), field("Cpus_allowed_list:"))
+    });
+    allowed.collect()
+}
+
+#[test]
+fn pinned_threads_have_a_cpu_each() {
+    let place = Place::new();
+    let all = available_parallelism().unwrap().get();
+    let mask = allowed_cpus(std::process::id()).into_values().next().unwrap();
+    let start = |name, threads: usize, groups: usize| {
+        let shape = format!("serve --env=MortarMayhem-Grid-v0 --num-envs=64 --service={name} --pin-threads");
+        let count = format!("--threads={threads} --groups={groups}");
+        let arguments: Vec<_> = shape.split(' ').chain(count.split(' ')).collect();
+        Process::spawn(place.endless(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()))
+    };
+    let mut refused = start("refused", all + 1, all + 1);
+    assert_eq!(refused.wait().code(), Some(1));
+    let error = refused.errors();
+    assert!(error.contains(&format!("need a CPU each, and this process may use {all}")), "{error}");
+    // One thread that takes requests and its worker; with one CPU, only the former.
+    let threads = all.min(2);
+    let engine = start("pinned", threads, 1);
+    reset(&mut place.trainer("pinned").unwrap(), 0);
+    let found = allowed_cpus(engine.id());
+    assert_eq!(found["endless"], mask, "{found:?}");
+    let mut bound: Vec<_> = found.iter().filter(|(_, cpus)| **cpus != mask).map(|(name, _)| name.as_str()).collect();
+    // The kernel keeps 15 bytes of a name.
+    let expected = ["endless-engine", "endless-worker-"];
+    bound.sort_unstable();
+    assert!(all == 1 || bound == expected[..threads], "{found:?}");
+    let cpus: BTreeSet<usize> = expected[..threads].iter().map(|name| found[*name].parse().unwrap()).collect();
+    assert_eq!(cpus.len(), threads, "{found:?}");
+    ended(engine, Signal::INT);
 }
 
 /// Ends an engine with a signal, and returns what it printed.

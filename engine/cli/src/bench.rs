@@ -37,6 +37,9 @@ pub struct Args {
     /// grows with the threads instead, in process and through the service, and where the time of a step goes.
     #[arg(long, value_name = "N,..", value_delimiter = ',', default_value = "1")]
     pub threads: Vec<usize>,
+    /// Bind each thread to a CPU of its own, as `endless serve --pin-threads` does; in process, all but the calling one.
+    #[arg(long)]
+    pin_threads: bool,
     /// Duration of one measurement in seconds.
     #[arg(long, default_value_t = 1.0)]
     pub seconds: f64,
@@ -271,6 +274,9 @@ pub fn in_process(
     threads: &Threads,
     stop: &AtomicBool,
 ) -> Result<Round, Failure> {
+    if args.pin_threads {
+        threads.pin(0)?;
+    }
     let mut pool = Pool::new(registry, &args.environment.configure(spec.id, args.num_envs)?, threads)?;
     let mut actions = Actions::new(spec, args.num_envs);
     let before = huge_pages::bytes(std::process::id(), huge_pages::PRIVATE);
@@ -300,7 +306,7 @@ pub fn through_service(
     stop: &AtomicBool,
 ) -> Result<Round, Failure> {
     let pool = args.environment.configure(spec.id, args.num_envs)?;
-    let mut engine = EngineProcess::start(EngineConfig::new("endless", pool, threads))?;
+    let mut engine = EngineProcess::start(EngineConfig::new("endless", pool, threads).pin_threads(args.pin_threads))?;
     let mut trainer = engine.connect(stop)?;
     let mut actions = Actions::new(spec, args.num_envs);
     trainer.reset(0, ResetRequest::All)?;

@@ -22,12 +22,13 @@ use super::stop::{self, Watchdog};
 const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The arguments, or groups of arguments, that make up a configuration.
-const CONFIGURATION: [&str; 12] = [
+const CONFIGURATION: [&str; 13] = [
     "EnvironmentArgs",
     "FrameArgs",
     "id",
     "num_envs",
     "threads",
+    "pin_threads",
     "groups",
     "service",
     "autoreset",
@@ -67,6 +68,9 @@ struct EngineArgs {
     /// Threads that step environments; 0 for one per core.
     #[arg(long, default_value_t = 0)]
     threads: usize,
+    /// Bind each of these threads to a CPU of its own, in the order of the process's affinity mask. Leave one CPU to the trainer.
+    #[arg(long)]
+    pin_threads: bool,
     /// Groups of environments. They are stepped independently, so that the trainer can process one while the engine
     /// steps another.
     #[arg(long, default_value_t = 1)]
@@ -114,6 +118,7 @@ impl EngineArgs {
             self.checkpoint.clone().map(|path| CheckpointConfig::new(path).every(self.every).resume(self.resume));
         let (groups, batches_held) = (self.groups, self.batches_held);
         Ok(EngineConfig::new(&self.service, pool, self.threads)
+            .pin_threads(self.pin_threads)
             .checkpoint(checkpoint)
             .groups(groups)
             .batches_held(batches_held))

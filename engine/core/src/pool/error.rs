@@ -96,6 +96,22 @@ pub enum PoolError {
         /// The operating system's error.
         source: std::io::Error,
     },
+    /// There are fewer CPUs than threads to bind to them.
+    #[error(
+        "{given} pinned threads need a CPU each, and this process may use {cpus}; use fewer threads, or do not pin them"
+    )]
+    PinnedThreads {
+        /// Number of threads, with those of other pools on the CPUs before theirs.
+        given: usize,
+        /// Number of CPUs in the affinity mask.
+        cpus: usize,
+    },
+    /// A thread cannot be bound to a CPU.
+    #[error("threads cannot be pinned: {source}")]
+    Pin {
+        /// The operating system's error.
+        source: std::io::Error,
+    },
     /// A call that needs running episodes came before the first reset of all environments.
     #[error("all environments must be reset before any other call")]
     NotReset,

@@ -1,5 +1,6 @@
 //! The threads that step a pool's environments.
 
+mod pinning;
 #[cfg(feature = "threads")]
 mod shares;
 mod step_times;
@@ -12,6 +13,8 @@ mod workers;
 use std::ops::Range;
 
 use super::error::PoolError;
+#[cfg(feature = "threads")]
+use super::sync::{Mutex, lock};
 #[cfg(feature = "threads")]
 use crate::batch::limits::MAX_THREADS;
 pub use step_times::StepTimes;
@@ -107,6 +110,33 @@ impl Threads {
         (0..callers).map(|caller| Self::start(of(caller), count, false)).collect()
     }
 
+    /// Binds each worker to one CPU: worker `n` to number `first + n` of the calling thread's affinity mask, in increasing order.
+    /// The calling thread is not bound; number `first` is left to it. To be called before
+    /// [`pin_caller`](Self::pin_caller). For pools that step at the same time, let `first` be the number of threads before these.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::PinnedThreads`] if the mask has fewer than `first + count` CPUs, and [`PoolError::Pin`] if the operating system
+    /// refuses, or is not Linux.
+    ///
+    /// ```no_run
+    /// let threads = endless_gym_core::pool::Threads::new(4)?;
+    /// threads.pin(0)?;
+    /// # Ok::<(), endless_gym_core::pool::PoolError>(())
+    /// ```
+    pub fn pin(&self, first: usize) -> Result<(), PoolError> {
+        let cpus = pinning::cpus(first.saturating_add(self.count()))?;
+        let (caller, failed) = (std::thread::current().id(), Mutex::new(None));
+        self.on_each(self.count(), &|thread| {
+            // In the child of a fork there are no workers, and the caller is called for them.
+            let is_caller = std::thread::current().id() == caller;
+            if let Err(error) = if is_caller { Ok(()) } else { pinning::pin(cpus[first + thread]) } {
+                *lock(&failed) = Some(error);
+            }
+        });
+        lock(&failed).take().map_or(Ok(()), Err)
+    }
+
     /// Number of threads that step environments at the same time, including the calling one.
     pub fn count(&self) -> usize {
         1 + self.workers.as_ref().map_or(0, |workers| workers.count())
@@ -132,6 +162,17 @@ impl Threads {
     }
 }
 
+impl Threads {
+    /// Binds the calling thread to one CPU: number `number` of its affinity mask. Threads that it starts inherit that.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`pin`](Self::pin).
+    pub fn pin_caller(number: usize) -> Result<(), PoolError> {
+        pinning::pin(pinning::cpus(number.saturating_add(1))?[number])
+    }
+}
+
 #[cfg(not(feature = "threads"))]
 impl Threads {
     /// The calling thread. `count` must be 0 or 1.
@@ -154,6 +195,15 @@ impl Threads {
     /// Those of [`new`](Self::new).
     pub fn timed(count: usize) -> Result<Self, PoolError> {
         Self::new(count)
+    }
+
+    /// Binds no thread, since there are no workers.
+    ///
+    /// # Errors
+    ///
+    /// None.
+    pub fn pin(&self, _first: usize) -> Result<(), PoolError> {
+        Ok(())
     }
 
     /// Number of threads that step environments at the same time: 1.

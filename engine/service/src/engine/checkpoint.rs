@@ -15,6 +15,7 @@ use std::time::Instant;
 use endless_gym_core::batch::Frames;
 use endless_gym_core::files;
 use endless_gym_core::pool::{SavedEnv, Seeding};
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
 
@@ -171,6 +172,8 @@ fn decode(path: &Path, bytes: &[u8], head: &CheckpointHead) -> Result<Vec<SavedG
 pub(crate) struct Checkpointer {
     config: CheckpointConfig,
     head: CheckpointHead,
+    /// Those of the process; `None` if they cannot be read.
+    cpus: Option<CpuSet>,
     /// Whether a request was executed since the last checkpoint.
     changed: AtomicBool,
     /// Held while the states of the groups are copied. A thread that uses a group must not wait for it.
@@ -199,6 +202,7 @@ impl Checkpointer {
         Ok(Checkpointer {
             config: config.clone(),
             head,
+            cpus: sched_getaffinity(None).ok(),
             changed: AtomicBool::new(false),
             saving: Mutex::new(Saving { last: Instant::now(), writing: None }),
             _lock: lock,
@@ -257,9 +261,14 @@ impl Checkpointer {
                 return tracing::error!(error = %e, "cannot save a checkpoint");
             }
         };
-        let (path, head) = (self.config.path.clone(), self.head.clone());
+        let (path, head, cpus) = (self.config.path.clone(), self.head.clone(), self.cpus);
         let thread = std::thread::Builder::new().name("checkpoint".to_owned());
-        match thread.spawn(move || write(&path, &head, saved)) {
+        let write = move || {
+            // Not on the CPU of the thread that starts this one, if that is bound to it.
+            let _ = cpus.map(|cpus| sched_setaffinity(None, &cpus));
+            write(&path, &head, saved)
+        };
+        match thread.spawn(write) {
             Ok(writing) => saving.writing = Some(writing),
             Err(e) => {
                 self.mark_changed();

@@ -52,6 +52,10 @@ pub struct EngineConfig {
     /// they can use (one for fewer than 64 environments) step at the same time.
     #[serde(default)]
     pub threads: usize,
+    /// Whether each thread that steps environments, those that take requests included, is bound to a CPU of its own, in the order of
+    /// the process's affinity mask. Linux only. More threads than CPUs are an error.
+    #[serde(default)]
+    pub pin_threads: bool,
     /// Batches of a group that a trainer or an observer may hold at a time, 1 to 16. The engine requires shared memory for two
     /// more.
     #[serde(default = "default_batches_held")]
@@ -89,6 +93,7 @@ impl EngineConfig {
             pool,
             groups: default_groups(),
             threads,
+            pin_threads: false,
             batches_held: default_batches_held(),
             observers: default_observers(),
             checkpoint: None,
@@ -101,6 +106,7 @@ impl EngineConfig {
         pool: PoolConfig,
         groups: usize,
         threads: usize,
+        pin_threads: bool,
         batches_held: usize,
         observers: usize,
         checkpoint: Option<CheckpointConfig>,

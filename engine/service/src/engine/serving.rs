@@ -103,6 +103,8 @@ struct Server {
     groups: Range<usize>,
     /// This thread and the workers that help it to step a large group.
     threads: Threads,
+    /// The CPU to which it is bound, as in [`Threads::pin_caller`].
+    cpu: Option<usize>,
     /// Whether it is executing a request.
     is_busy: AtomicBool,
 }
@@ -179,6 +181,9 @@ impl Engine {
         discovery::refuse_second_engine(&node, &config.service, &node.lock()?)?;
         let pools = config.pools()?;
         let threads = Threads::divided(config.threads, config.pool.num_envs, config.groups)?;
+        if config.pin_threads {
+            (0..threads.len()).try_for_each(|server| threads[server].pin(first_cpu(&threads, server)))?;
+        }
         // Each group's pool has its server's threads, which prefault its memory.
         let server =
             |group| (0..threads.len()).rfind(|server| first_group(config, &threads, *server) <= group).unwrap_or(0);
@@ -231,6 +236,7 @@ impl Engine {
         let servers = threads.iter().enumerate().map(|(server, own)| Server {
             groups: first_group(config, threads, server)..first_group(config, threads, server + 1),
             threads: own.clone(),
+            cpu: config.pin_threads.then(|| first_cpu(threads, server)),
             is_busy: AtomicBool::new(false),
         });
         let servers = servers.collect();
@@ -313,7 +319,10 @@ impl Engine {
     /// The loop of a server, until `stop` returns true.
     fn serve(&self, number: usize, stop: &dyn Fn() -> bool) -> Result<(), ServiceError> {
         let server = &self.servers[number];
-        let Server { groups: own, threads, is_busy } = server;
+        let Server { groups: own, threads, cpu, is_busy } = server;
+        if let Some(cpu) = cpu {
+            Threads::pin_caller(*cpu)?;
+        }
         let (mut last_request, mut next) = (Instant::now(), own.start);
         let mut chores = (number == 0).then(Chores::new);
         while !stop() {
@@ -492,6 +501,11 @@ impl Engine {
 /// The first group of a server.
 fn first_group(config: &EngineConfig, threads: &[Threads], server: usize) -> usize {
     server * config.groups / threads.len()
+}
+
+/// The CPU of a server, which those of its workers follow.
+fn first_cpu(threads: &[Threads], server: usize) -> usize {
+    threads[..server].iter().map(Threads::count).sum()
 }
 
 fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, PoolError> {
