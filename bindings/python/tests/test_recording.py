@@ -327,21 +327,6 @@ def test_experts_check_their_arguments() -> None:
         endless_gym.Experts("MortarMayhem-v0", 0)
 
 
-def test_experts_play_with_next_step_auto_reset() -> None:
-    with endless_gym.make_vec("MysteryPath-Grid-v0", 6, observation="features", seed=0) as envs:
-        experts = endless_gym.Experts("MysteryPath-Grid-v0", 6)
-        observation, _ = envs.reset()
-        episode_start, successes, ends = np.ones(6, dtype=bool), 0, 0
-        ended = np.zeros(6, dtype=bool)
-        while ends < 20:
-            observation, _, terminated, _, info = envs.step(experts.act(observation, episode_start))
-            # The step after the end of an episode only starts the next one.
-            episode_start, ended = ended, terminated.copy()
-            ends += int(terminated.sum())
-            successes += int(info.get("success", np.zeros(1)).sum())
-        assert successes == ends
-
-
 def test_the_values_of_a_repeated_flag_accumulate() -> None:
     repeated = [
         "MortarMayhem-v0",
