@@ -24,7 +24,7 @@ from endless_gym_agents import atomic, checkpoint
 from endless_gym_agents.curves import published
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.logs import read_progress
-from endless_gym_agents.metrics import metric
+from endless_gym_agents.results import metric
 
 FOLDER = Path(__file__).parent / "hour"
 #: Flags of all runs: one thread, and 64 environments with rollouts of 128 steps, which are also the length of BPTT.

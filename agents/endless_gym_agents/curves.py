@@ -17,10 +17,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from endless_gym_agents import metrics
 from endless_gym_agents.checkpoint import read_settings
 from endless_gym_agents.logs import PROGRESS, read_progress
-from endless_gym_agents.results import Experiment, label
+from endless_gym_agents.results import Experiment, label, metric
 from endless_gym_agents.statistics import interquartile_mean, stratified_bootstrap
 
 Floats = NDArray[np.float64]
@@ -109,7 +108,7 @@ def evaluated(experiment: Experiment) -> Curve:
     Raises:
         ValueError: There are no such steps.
     """
-    name, _ = metrics.metric(experiment.env)
+    name, _ = metric(experiment.env)
     steps = np.array(experiment.common_steps(), dtype=np.int64)
     if not steps.size:
         raise ValueError(
@@ -147,7 +146,7 @@ def scale(env: str) -> float:
     1 for task progress. Commands, tiles and coins are divided by the highest mean over runs that the GRU of the paper reaches
     at any checkpoint.
     """
-    if metrics.is_finite(env):
+    if metric(env).name == "task_progress":
         return 1.0
     name = "gru_rec" if env == _WITH_RECONSTRUCTION else "gru"
     (curve,) = published(env, [name])

@@ -15,7 +15,6 @@ from endless_gym.engine import serve
 from endless_gym.episodes import EpisodeOptions
 from endless_gym.specs import Spec, spec
 from endless_gym.vector import EndlessVectorEnv
-from endless_gym_agents.metrics import TASK_PROGRESS, task_progress
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.recovery import RecoverableEngine
 from endless_gym_agents.settings import TRAINING_SEEDS, Settings
@@ -84,9 +83,6 @@ class Environments:
         wanted, ranks = settings.environment, ranks or Ranks()
         own = ranks.share(wanted.num_envs)
         self.spec: Spec = spec(settings.env)
-        self._options = settings.options()
-        # In Mystery Path it needs the length of each episode's path, which only the evaluation computes.
-        self._has_progress = episode_options is None and not settings.env.startswith("MysteryPath")
         self.groups, self.per_group = wanted.groups, len(own) // wanted.groups
         in_process = wanted.engine == "thread"
         arguments: dict[str, Any] = {
@@ -147,9 +143,6 @@ class Environments:
             final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
             final.pop("ground_truth", None)
             episodes = [{key: float(value[env]) for key, value in final.items()} for env in np.flatnonzero(done)]
-            for episode in episodes if self._has_progress else ():
-                progress = task_progress(self.spec, self._options, episode)
-                episode |= {} if progress is None else {TASK_PROGRESS: progress}
         return StepResult(observation, reward, done, info.get("ground_truth"), episodes)
 
     def mark(self, report: Callable[[str], None]) -> None:

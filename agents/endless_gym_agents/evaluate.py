@@ -10,7 +10,6 @@ import torch
 from endless_gym.specs import spec
 from endless_gym_agents import wrappers
 from endless_gym_agents.agent import Agent
-from endless_gym_agents.metrics import TASK_PROGRESS, path_length, task_progress
 
 #: The paper's protocol: seeds that training never uses, and episodes per seed. Actions are sampled, so the episodes of a seed
 #: differ.
@@ -40,16 +39,13 @@ def evaluate(
         ended: Called with the number of episodes that have ended, after each step in which some have.
 
     Returns:
-        The final infos of all episodes, each with `seed`, and with `task_progress` in finite environments; all seeds in order,
-        repeated `repetitions` times.
+        The final infos of all episodes, each with `seed`; all seeds in order, repeated `repetitions` times.
     """
     settings, env_spec = agent.settings, spec(agent.settings.env)
-    options = settings.options()
     episode_seeds = [seed for _ in range(repetitions) for seed in seeds]
     num_envs = len(episode_seeds)
     memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(action_seed)
     results: list[dict[str, float]] = [{} for _ in episode_seeds]
-    paths = {seed: path_length(env_spec.id, options, seed) for seed in seeds}
     with wrappers.make(settings, num_envs, num_threads, seeds=episode_seeds) as envs:
         observation, _ = envs.reset()
         while not all(results):
@@ -65,10 +61,7 @@ def evaluate(
                 final = info["final_info"]
                 names = [name for name in final if not name.startswith("_") and name != "ground_truth"]
                 result = {name: float(final[name][env]) for name in names}
-                progress = task_progress(env_spec, options, result, paths[episode_seeds[env]])
                 results[env] = result | {"seed": float(episode_seeds[env])}
-                if progress is not None:
-                    results[env][TASK_PROGRESS] = progress
             if ended is not None and first:
                 ended(len(first))
     return results

@@ -29,7 +29,6 @@ from endless_gym_agents import atomic, command
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.checkpoint import Checkpoint, load, protected, to_safetensors
 from endless_gym_agents.evaluate import evaluate, mean
-from endless_gym_agents.metrics import TASK_PROGRESS
 from endless_gym_agents.ranges import Positive
 from endless_gym_agents.settings import Settings, to_dict
 
@@ -99,8 +98,8 @@ def evaluations(agent: Agent) -> list[dict[str, Any]]:
         finally:
             agent.settings = trained
         measured: dict[str, Any] = {"options": chosen, "episodes": len(results), "mean_reward": round(mean(results), 6)}
-        if TASK_PROGRESS in results[0]:
-            successes = sum(result[TASK_PROGRESS] > 1.0 - 1e-6 for result in results)
+        if "task_progress" in results[0]:
+            successes = sum(result["task_progress"] > 1.0 - 1e-6 for result in results)
             measured["success"] = round(successes / len(results), 6)
         found.append(measured)
     return found

@@ -9,12 +9,13 @@ import math
 import os
 import secrets
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from endless_gym.specs import Spec
 from endless_gym_agents import atomic, regular
 from endless_gym_agents.clock import duration
 from endless_gym_agents.command import Terminal
@@ -149,6 +150,14 @@ def means(episodes: Collection[dict[str, float]]) -> dict[str, float]:
     """Mean of each final info of the episodes under the key `episode/NAME`; empty without episodes."""
     names = next(iter(episodes), {})
     return {f"episode/{name}": sum(infos[name] for infos in episodes) / len(episodes) for name in names}
+
+
+def learnt(spec: Spec, means: Mapping[str, float]) -> str | None:
+    """Why the task counts as learnt according to the `means` of the last episodes, for a message; `None` if it does not."""
+    reached = None if spec.learnt is None else means.get(f"episode/{spec.learnt.name}")
+    if spec.learnt is None or reached is None or reached < spec.learnt.mean:
+        return None
+    return f"the last episodes have a mean {spec.learnt.name} of {reached:.3f}, and {spec.learnt.mean} is enough"
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:

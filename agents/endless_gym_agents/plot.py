@@ -23,7 +23,7 @@ from typing import Literal
 import tyro
 
 from endless_gym.printable import printable
-from endless_gym_agents import atomic, command, metrics
+from endless_gym_agents import atomic, command
 from endless_gym_agents.curves import (
     AXES,
     FAMILIES,
@@ -38,7 +38,7 @@ from endless_gym_agents.curves import (
 )
 from endless_gym_agents.palette import AGENTS
 from endless_gym_agents.ranges import Natural
-from endless_gym_agents.results import read
+from endless_gym_agents.results import metric, read
 
 Spread = Literal["std", "iqm", "runs"]
 
@@ -241,7 +241,7 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
                 file=sys.stderr,
             )
         curves = mine + paper
-        add(env, metrics.metric(env)[1], curves)
+        add(env, metric(env).label, curves)
     return plots
 
 

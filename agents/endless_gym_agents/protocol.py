@@ -24,10 +24,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from endless_gym_agents import atomic, checkpoint, command, metrics, tables
+from endless_gym_agents import atomic, checkpoint, command, tables
 from endless_gym_agents.evaluate import EVALUATION_SEEDS, REPETITIONS, evaluate
 from endless_gym_agents.ranges import Natural, Positive
-from endless_gym_agents.results import Experiment, Experiments, Run, to_json
+from endless_gym_agents.results import Experiment, Experiments, Run, metric, to_json
 from endless_gym_agents.train import choose_device
 
 
@@ -162,14 +162,15 @@ def table(experiment: Experiment) -> Table:
     successes are marked, and the caption says which metric to trust.
     """
     options = "".join(f", {name}={value}" for name, value in experiment.options.items())
-    first, _ = metrics.metric(experiment.env)
+    first, _ = metric(experiment.env)
     rows = [(first, *row) for row in experiment.summaries(first)]
     # The paper calls the agent without memory by its algorithm.
     label = "none (ppo in the paper)" if experiment.label == "ppo" else experiment.label
     title = f"{experiment.env}, {label}, over {rows[0][-1]}{options}"
     others = [name for name in experiment.runs[0].metrics if name != first]
     rows += [(name, *row) for name in others for row in experiment.summaries(name)[-1:]]
-    doubtful = set(metrics.counts_failures(experiment.env)).intersection(others)
+    # In finite Mortar Mayhem.
+    doubtful = {"success", "commands_completed"} if "commands_completed" in others else set()
     caption = (
         f"Trust {first}. * as the original reports it: a last command that failed counts as executed, so that an agent "
         "that fails can reach 1.0."

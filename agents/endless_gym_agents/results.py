@@ -10,10 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from endless_gym_agents import metrics, regular
+from endless_gym.specs import Metric, spec
+from endless_gym_agents import regular
 from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.settings import Recurrence, Settings
 from endless_gym_agents.statistics import Summary, summarise
+
+
+def metric(env: str) -> Metric:
+    """Name of an environment's metric in the results, and its plot label; the return if there is no such environment here."""
+    try:
+        return spec(env).metric
+    except ValueError:
+        return Metric("reward", "Return")
 
 
 @dataclass
@@ -161,7 +170,7 @@ def to_json(
         if not with_episodes:
             for run in values["runs"]:
                 del run["episodes"]
-        name, _ = metrics.metric(experiment.env)
+        name, _ = metric(experiment.env)
         values["metric"] = name
         values["summary"] = [
             {"steps": step, "over": over, **asdict(summary)} for step, summary, over in experiment.summaries(name)

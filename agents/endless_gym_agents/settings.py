@@ -18,7 +18,6 @@ from torch import nn
 
 from endless_gym.specs import DEFAULT_ENV_ID, spec
 from endless_gym_agents import own, ranges
-from endless_gym_agents.metrics import is_finite
 from endless_gym_agents.own import MEMORIES
 from endless_gym_agents.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
 
@@ -253,8 +252,8 @@ class Settings:
     target_reward: Annotated[float | None, Range()] = None
     """stop when the mean reward of the last 100 episodes reaches this value"""
     stop_when_learnt: bool = False
-    """stop when the last 100 episodes show that the task is learnt: with 90 % of the best possible reward in Mortar Mayhem, with
-    success in 90 % of the episodes in the other finite environments. A target reward replaces it. The default of `quick`"""
+    """stop when the last 100 episodes show that the task is learnt: with a mean task progress of 90 % in Mortar Mayhem, with
+    success in 90 % of the episodes in other environments that report it. A target reward replaces it. The default of `quick`"""
     wandb: bool = False
     """also log to Weights & Biases, if it is installed"""
     view: bool = False
@@ -307,7 +306,7 @@ class Settings:
         """
         ranges.check(self)
         env_spec = spec(self.env)
-        env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
+        env_spec.max_episode_steps(self.options())  # raises if the options are not valid
         if self.agent_class:
             own.load("--agent", self.agent_class, nn.Module)
         elif self.agent not in AGENTS:
@@ -386,7 +385,8 @@ class Settings:
 
     def _longest_episode(self) -> int:
         """Longest possible episode in steps; 0 in endless environments and without a step limit."""
-        return max(0, spec(self.env).max_episode_steps(self.options())) if is_finite(self.env) else 0
+        described = spec(self.env)
+        return max(0, described.max_episode_steps(self.options())) if described.learnt else 0
 
 
 def _named_values(flag: str, items: tuple[str, ...], example: str) -> dict[str, Any]:

@@ -30,8 +30,7 @@ from endless_gym_agents import atomic, checkpoint, command, run_folder
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
-from endless_gym_agents.learnt import learnt
-from endless_gym_agents.logs import RECENT, Logger, SilentLogger, means
+from endless_gym_agents.logs import RECENT, Logger, SilentLogger, learnt, means
 from endless_gym_agents.ppo import Diverged, learn, make_optimizer
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.rollout import RolloutCollector
@@ -193,7 +192,7 @@ def train_rank(
             if reward is not None and target is not None and len(episodes) == RECENT and reward >= target:
                 stop.requested = True
             if settings.stop_when_learnt and target is None and len(episodes) == RECENT:
-                success = learnt(environments.spec, settings.options(), recent)
+                success = learnt(environments.spec, recent)
                 stop.requested = stop.requested or success is not None
             if environments.failure is not None:
                 stop.requested = True

@@ -9,18 +9,15 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from agents_helpers import changed, settings
 from rich.console import Console
 
 import endless_gym_agents
-from endless_gym.env import Env
 from endless_gym.specs import spec
 from endless_gym_agents import checkpoint, protocol, tables
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.evaluate import evaluate
-from endless_gym_agents.metrics import path_length, task_progress
 from endless_gym_agents.protocol import EvalArguments, evaluate_runs, find
 from endless_gym_agents.results import Experiment, Experiments, Run, label, read, to_json
 from endless_gym_agents.train import parse, train
@@ -46,70 +43,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def small(*paths: Path, **changes: object) -> EvalArguments:
     return replace(EvalArguments(paths), seeds=5, threads=1, engine_threads=1, **changes)
-
-
-@pytest.mark.parametrize(
-    ("env", "options", "final", "path", "expected"),
-    [
-        ("MortarMayhem-v0", {}, {"reward": 0.3, "commands_completed": 0.3, "success": 0}, 0, 0.3),
-        # The last command failed, but the infos count it.
-        ("MortarMayhem-v0", {}, {"reward": 0.9, "commands_completed": 1.0, "success": 1}, 0, 0.9),
-        ("MortarMayhem-v0", {}, {"reward": 1.0, "commands_completed": 1.0, "success": 1}, 0, 1.0),
-        (GRID, {"command_count": [1]}, {"reward": 0.0, "commands_completed": 1.0, "success": 1}, 0, 0.0),
-        (GRID, {"command_count": [2, 4]}, {"reward": 0.3, "commands_completed": 1.0, "success": 1}, 0, 0.75),
-        ("MysteryPath-v0", {}, {"reward": 0.4, "success": 0}, 8, 0.5),
-        ("MysteryPath-v0", {}, {"reward": 1.7, "success": 1}, 8, 1.0),
-        ("MysteryPath-Grid-v0", {}, {"reward": 1.0, "success": 1}, 8, 1.0),
-        ("MysteryPath-Grid-v0", {}, {"reward": 0.0, "success": 0}, 8, 0.0),
-        ("SearingSpotlights-v0", {}, {"coins_collected": 1, "success": 0}, 0, 0.5),
-        ("SearingSpotlights-v0", {}, {"coins_collected": 1, "success": 1}, 0, 1.0),
-        ("SearingSpotlights-v0", {"num_coins": [4]}, {"coins_collected": 1, "success": 0}, 0, 0.125),
-        ("Endless-MysteryPath-v0", {}, {"reward": 0.4, "tiles_visited": 4}, 0, None),
-    ],
-)
-def test_task_progress_is_computed_from_infos_and_reward(
-    env: str, options: dict[str, object], final: dict[str, float], path: int, expected: float | None
-) -> None:
-    progress = task_progress(spec(env), options, final, path)
-    assert progress == (expected if expected is None else pytest.approx(expected))
-
-
-REWARDS = (
-    {},
-    {"reward_episode_success": 1.0},
-    {"reward_command_failure": -0.1},
-    {"reward_command_success": 0.0, "reward_episode_success": 1.0},
-    {"reward_command_failure": 0.05, "reward_episode_success": 0.7},
-)
-
-
-@pytest.mark.parametrize("rewards", REWARDS, ids=str)
-@pytest.mark.parametrize("counts", [[1], [2], [2, 4]], ids=str)
-def test_task_progress_of_mortar_mayhem_is_that_of_the_game(counts: list[int], rewards: dict[str, float]) -> None:
-    """An untrained agent has `success` whenever it fails at the last command; its task progress is what it executed."""
-    times = {"command_show_duration": [1], "command_show_delay": [0], "explosion_delay": [5], "explosion_duration": [1]}
-    options = {"command_count": counts, **times, **rewards}
-    env, draws, failed = Env(GRID, options=options, observation="features"), np.random.default_rng(35), 0
-    for seed in range(40):
-        env.reset(seed=seed)
-        done = False
-        while not done:
-            _, _, terminated, truncated, info = env.step(int(draws.integers(4)))
-            done = terminated or truncated
-        executed, commands = env.progress()["commands"]
-        assert task_progress(spec(GRID), options, info) == pytest.approx(executed / commands)
-        failed += info["success"] == 1 and executed < commands
-    assert failed > 0
-
-
-def test_a_failure_with_the_reward_of_a_success_counts_as_failed() -> None:
-    final = {"reward": 0.2, "commands_completed": 1.0, "success": 1}
-    options = {"command_count": [2], "reward_command_failure": 0.1}
-    assert task_progress(spec(GRID), options, final) == 0.5
-
-
-def test_path_lengths_match_the_published_episodes() -> None:
-    assert [path_length("MysteryPath-v0", {}, seed) for seed in range(200_000, 200_050)] == PATHS
 
 
 def test_task_progress_uses_the_path_length_of_each_seed() -> None:
@@ -255,6 +188,7 @@ def test_the_table_says_which_metric_to_trust() -> None:
     assert "64 success * 1.0000" in table and "64 commands_completed * 1.0000" in table
     assert "64 task_progress 0.3900" in table
     assert "Trust task_progress. * as the original reports it: a last command that failed counts as executed" in table
+    del episodes[0]["commands_completed"]
     for env in ("MysteryPath-v0", "SearingSpotlights-v0"):
         assert "*" not in printed(env) and "Trust" not in printed(env)
 

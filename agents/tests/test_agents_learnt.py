@@ -1,42 +1,35 @@
 """When a task counts as learnt, and the runs that stop then."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from agents_helpers import settings
 
+import endless_gym
 from endless_gym import spec
-from endless_gym_agents.learnt import learnt
+from endless_gym.specs import Learnt
+from endless_gym_agents.logs import learnt
 from endless_gym_agents.train import train
 
 GRID = "MortarMayhem-Grid-v0"
 
 
 @pytest.mark.parametrize(
-    ("id", "options", "means", "is_learnt"),
+    ("id", "means", "is_learnt"),
     [
-        (GRID, {"command_count": [1]}, {"reward": 0.089, "success": 1.0}, False),
-        (GRID, {"command_count": [1]}, {"reward": 0.091, "success": 1.0}, True),
-        (GRID, {"command_count": [1, 3]}, {"reward": 0.19, "success": 1.0}, True),
-        (GRID, {"command_count": [1, 3]}, {"reward": 0.17, "success": 1.0}, False),
-        (GRID, {"reward_episode_success": 1.0}, {"reward": 1.7, "success": 1.0}, False),
-        (GRID, {"reward_episode_success": 1.0}, {"reward": 1.85, "success": 1.0}, True),
-        (GRID, {"reward_command_success": 0.0}, {"reward": 0.0, "success": 1.0}, False),
-        # Every agent reaches this reward.
-        (GRID, {"command_count": [1], "reward_command_failure": 0.1}, {"reward": 0.1, "success": 1.0}, False),
-        ("MysteryPath-v0", {}, {"reward": 9.0, "success": 0.89}, False),
-        ("MysteryPath-v0", {}, {"reward": 0.1, "success": 0.91}, True),
-        ("SearingSpotlights-v0", {}, {"reward": 0.1, "success": 0.91}, True),
-        ("Endless-MortarMayhem-v0", {}, {"reward": 100.0}, False),
-        (GRID, {}, {}, False),
+        (GRID, {"task_progress": 0.89, "success": 1.0}, False),
+        (GRID, {"task_progress": 0.91, "success": 0.0}, True),
+        ("MysteryPath-v0", {"reward": 9.0, "success": 0.89}, False),
+        ("MysteryPath-v0", {"reward": 0.1, "success": 0.91}, True),
+        ("Endless-MortarMayhem-v0", {"reward": 100.0, "success": 1.0}, False),
+        (GRID, {}, False),
     ],
 )
-def test_task_is_learnt_at_nine_tenths_of_its_best_result(
-    id: str, options: dict[str, object], means: dict[str, float], is_learnt: bool
-) -> None:
+def test_task_is_learnt_at_nine_tenths_of_its_best_result(id: str, means: dict[str, float], is_learnt: bool) -> None:
     given = {f"episode/{name}": value for name, value in means.items()}
-    assert (learnt(spec(id), options, given) is not None) is is_learnt
+    assert (learnt(spec(id), given) is not None) is is_learnt
 
 
 @pytest.mark.slow
@@ -52,7 +45,8 @@ def test_run_stops_with_a_message_when_the_task_is_learnt(
 ) -> None:
     ppo = {"steps": 32, "minibatches": 1, "updates": 25}
     # So that an untrained agent, which executes one command of four, reaches it.
-    monkeypatch.setattr("endless_gym_agents.learnt.SHARE", 0.05)
+    easy = replace(spec(GRID), learnt=Learnt("task_progress", 0.05))
+    monkeypatch.setitem(endless_gym.all_specs(), GRID, easy)
     environment = {"num_envs": 8, "option": ("command_count=[1]",)}
     given = settings(
         "none", env=GRID, run=str(tmp_path / "run"), threads=1, environment=environment, ppo=ppo, **changes
@@ -60,6 +54,6 @@ def test_run_stops_with_a_message_when_the_task_is_learnt(
     run = train(given)
     updates = len((run / "progress.jsonl").read_text().splitlines())
     output = " ".join(capsys.readouterr().out.split())
-    assert ("the task is learnt: the last episodes have a mean reward of 0.0" in output) is stops
+    assert ("the task is learnt: the last episodes have a mean task_progress of 0." in output) is stops
     assert (updates < 25) is stops
     assert json.loads((run / "settings.json").read_text())["stop_when_learnt"] is given.stop_when_learnt

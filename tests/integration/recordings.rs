@@ -116,8 +116,8 @@ fn progress_ends_at_the_final_info() {
             let share = |name: &str| shown(name).map(|shown| shown.value / shown.of.unwrap_or(1.0));
             match spec.id {
                 "Endless-MortarMayhem-v0" => assert_eq!(share("commands"), info("commands_completed")),
-                // The original counts a failed last command as executed, and a command as failed if the agent left its
-                // tile too early.
+                // The original counts a failed last command as executed. It and the task progress count a command as failed if
+                // the agent left its tile too early.
                 id if id.starts_with("Mortar") => {
                     let (shown, of) = shown("commands").map(|shown| (shown.value, shown.of.unwrap())).unwrap();
                     let counted = (info("commands_completed").unwrap() * of).round();
@@ -126,13 +126,18 @@ fn progress_ends_at_the_final_info() {
                         [0.0, 1.0].contains(&differs) || (differs == -1.0 && counted == of),
                         "{id}: {shown} {counted}"
                     );
+                    assert_eq!(info("task_progress"), Some(shown.min(counted) / of));
                 }
                 id if id.contains("MysteryPath") => {
                     assert_eq!(share("falls"), info("num_fails"));
                     assert!(info("tiles_visited").is_none_or(|tiles| share("tiles") == Some(tiles)), "{id}");
+                    let progress = if id.contains("Grid") { info("success") } else { share("tiles") };
+                    assert!(info("task_progress").is_none_or(|shown| progress == Some(shown)), "{id}");
                 }
                 _ => {
                     assert_eq!(share("coins"), info("coins_collected"));
+                    let halves = info("success").map(|success| (share("coins").unwrap() + success) / 2.0);
+                    assert_eq!(info("task_progress"), halves);
                     assert_eq!(share("health"), info("agent_health"));
                 }
             }

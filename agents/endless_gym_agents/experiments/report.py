@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from endless_gym_agents import atomic, metrics, regular, results
+from endless_gym_agents import atomic, regular, results
 from endless_gym_agents.curves import AXES, FAMILIES, Curve, aggregate, evaluated, published
 from endless_gym_agents.experiments import planning
 from endless_gym_agents.experiments.definitions import Run
@@ -119,7 +119,7 @@ def _curves(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
         rows.append(_row(task, run, curve))
     figures = []
     for task, (env, curves, labels) in panels.items():
-        _, axis = metrics.metric(env)
+        _, axis = results.metric(env)
         name = task.replace(" ", "-").replace("=", "-")
         figures.append(draw(name, axis, [*curves, *published(env, labels)], "std", folder))
         if curves[0].steps[-1] < 0.1 * max((one.steps[-1] for one in published(env, labels)), default=0):
@@ -137,7 +137,7 @@ def _curves(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
 
 def _row(task: str, run: Run, curve: Curve) -> Row:
     """The scores of a run at its last and at its best checkpoint."""
-    name, _ = metrics.metric(run.env)
+    name, _ = results.metric(run.env)
     row: Row = {"environment": task, "run": run.name, "metric": name}
     found = [("", curve)] + [(" (paper)", one) for one in published(run.env, [run.published])]
     for suffix, one in found:
@@ -212,7 +212,7 @@ def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]
                 at = np.rint(curve.steps / PAPER_STEPS_PER_UPDATE * mean).astype(np.int64)
                 panels.setdefault(run.env, []).append(replace(curve, label=label, steps=at))
     return rows, [
-        draw(f"{env}-wall-time", metrics.metric(env)[1], curves, "std", folder, HOURS) for env, curves in panels.items()
+        draw(f"{env}-wall-time", results.metric(env)[1], curves, "std", folder, HOURS) for env, curves in panels.items()
     ]
 
 

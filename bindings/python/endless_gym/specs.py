@@ -92,6 +92,24 @@ class ActionBranch(NamedTuple):
     choices: tuple[Meaning, ...]
 
 
+class Metric(NamedTuple):
+    """The number of an episode by which agents are compared."""
+
+    #: Its name: `reward`, `length` or a final info.
+    name: str
+    #: Label in plots.
+    label: str
+
+
+class Learnt(NamedTuple):
+    """When a task counts as learnt: the mean of a number over the last episodes reaches a share of the best possible one."""
+
+    #: Its name, as in `Metric`. A task without a final info of that name never counts as learnt.
+    name: str
+    #: The least mean.
+    mean: float
+
+
 @dataclass(frozen=True)
 class Spec:
     """The specification of an environment id."""
@@ -124,6 +142,10 @@ class Spec:
     feature_columns: tuple[Meaning, ...]
     #: Reset parameters with their defaults.
     reset_parameters: dict[str, Any]
+    #: The number by which agents are compared.
+    metric: Metric
+    #: When the task counts as learnt; `None` for a task whose episodes get longer the better the agent is.
+    learnt: Learnt | None
     render_fps: int
     #: Name of the native module that plays the environment.
     module: str = _native.__name__
@@ -195,27 +217,13 @@ class Spec:
         return features if self.described_features is None else _observation(self.described_features, features)
 
     def max_episode_steps(self, options: Mapping[str, Any]) -> int:
-        """The step limit of an episode with these reset parameters, as in the original; -1 for none.
+        """The step limit of an episode with these reset parameters, as in the original; -1 for none, and for an environment of an
+        engine that this process does not have.
 
         Raises:
-            ValueError: A reset parameter has a value of the wrong type.
+            ValueError: A reset parameter is unknown, or has the wrong type or range.
         """
-        parameters = {**self.reset_parameters, **options}
-        try:
-            if "max_steps" in parameters:
-                return int(parameters["max_steps"])
-            if "explosion_duration" not in self.reset_parameters:
-                return -1
-            # Mortar Mayhem: the largest number of commands with the longest durations.
-            longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
-            clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
-            execution = longest["explosion_duration"] + longest["explosion_delay"]
-            return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
-        except (KeyError, OverflowError, TypeError, ValueError):
-            raise ValueError(
-                "options must have a number for `max_steps`, and lists of numbers for commands and explosions, "
-                f"got {dict(options)}"
-            ) from None
+        return int(self.native.max_episode_steps(self.id, options_text(options)))
 
     def ground_truth_space(self) -> gymnasium.Space[Any] | None:
         """The space of `info["ground_truth"]`, in Memory Gym the original's."""
@@ -346,6 +354,8 @@ def described_spec(described: dict[str, Any], module: str = _native.__name__) ->
         described_features=described["observation_space"],
         feature_columns=_meanings(described["features"]),
         reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
+        metric=Metric(**described["metric"]),
+        learnt=None if described["learnt"] is None else Learnt(**described["learnt"]),
         render_fps=described["render_fps"],
         module=module,
     )

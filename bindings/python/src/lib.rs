@@ -50,6 +50,15 @@ fn specs() -> PyResult<String> {
     serde_json::to_string(&specs).map_err(|error| PyRuntimeError::new_err(error.to_string()))
 }
 
+/// The maximum number of steps of an episode with reset parameters, an object of JSON; -1 without a limit, or if this module does not
+/// have the id.
+#[pyfunction]
+fn max_episode_steps(id: &str, options: &str) -> PyResult<i64> {
+    let Ok(spec) = environments().spec(id) else { return Ok(-1) };
+    let limit = spec.max_episode_steps(&arguments::json(options)?);
+    Ok(limit.map_err(|error| PyValueError::new_err(error.to_string()))?.unwrap_or(-1))
+}
+
 /// Runs the program `endless` and returns its exit status. `executable` is the command that starts it in a new process.
 #[pyfunction]
 fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) -> u8 {
@@ -111,5 +120,6 @@ pub fn populate(module: &Bound<'_, PyModule>, registry: Result<Registry, Registr
     module.add_function(wrap_pyfunction!(connection::segment_prefix, module)?)?;
     module.add_function(wrap_pyfunction!(ends::ended_episodes, module)?)?;
     module.add_function(wrap_pyfunction!(endless, module)?)?;
+    module.add_function(wrap_pyfunction!(max_episode_steps, module)?)?;
     module.add_function(wrap_pyfunction!(specs, module)?)
 }

@@ -59,6 +59,7 @@ def test_env_equals_the_original_step_by_step(id: str, original_python: str, tmp
     ends = 0
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(int(action[0]) if len(action) == 1 else action)
+        assert 0 <= info.pop("task_progress", 0) <= 1  # the original does not return it
         check(observation, reward, terminated, truncated, info, env.render())
         if terminated:
             observation, info = env.reset(options=options)

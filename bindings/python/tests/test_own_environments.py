@@ -75,7 +75,12 @@ def test_exceptions_of_engines_are_those_of_the_package():
     assert not hasattr(_native, "EngineLost")
 
 
-def test_an_environment_without_the_parameter_max_steps_has_no_known_limit():
+def test_step_limits_are_those_of_the_native_module():
     found = endless_gym.spec("MysteryPath-v0")
     assert found.max_episode_steps({"max_steps": 7}) == 7
-    assert replace(found, reset_parameters={"width": 3}).max_episode_steps({}) == -1
+    assert found.max_episode_steps({"max_steps": 0}) == -1
+    assert endless_gym.spec("MortarMayhem-v0").max_episode_steps({"command_count": [2, 3]}) == 79
+    with pytest.raises(ValueError, match=r"reset parameter `max_steps` must be an integer, got 0\.5"):
+        found.max_episode_steps({"max_steps": 0.5})
+    # An engine of another build plays it.
+    assert replace(found, id="Unknown-v0").max_episode_steps({"max_steps": 7}) == -1

@@ -122,10 +122,10 @@ export function arrowOf(command) {
 /** How an episode ended: `success`, `failure`, `end` if the environment defines no success, or null before its end. */
 export function outcomeOf(state) {
   if (!state.done) return null;
-  if (!("success" in (state.info ?? {}))) return "end";
-  // The original counts a failed last command as a success; the progress does not.
-  const complete = !state.id.startsWith("MortarMayhem") || state.progress.every(({ value, of }) => value >= of);
-  return state.info.success === 1 && complete ? "success" : "failure";
+  // In Mortar Mayhem, the original counts a failed last command as a success; the task progress does not.
+  const done = state.info?.task_progress ?? state.info?.success;
+  if (done === undefined) return "end";
+  return done === 1 ? "success" : "failure";
 }
 
 /** The commands in the vector observation of MortarMayhemB, as arrows and as words. */

@@ -147,12 +147,8 @@ pub fn learn(
             let reward = metrics::value(&recent, "episode/reward");
             reason = match settings.target_reward {
                 Some(target) => (reward >= target).then(|| format!("the mean reward is {reward:.3}")),
-                None if settings.stop_when_learnt => {
-                    let options = settings.options()?;
-                    let learnt = metrics::learnt(&player.environments.spec, &options, &recent);
-                    learnt
-                        .map(|reason| format!("the task is learnt: {reason}; train longer with --no-stop-when-learnt"))
-                }
+                None if settings.stop_when_learnt => metrics::learnt(&player.environments.spec, &recent)
+                    .map(|reason| format!("the task is learnt: {reason}; train longer with --no-stop-when-learnt")),
                 None => None,
             };
         }

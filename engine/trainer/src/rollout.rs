@@ -79,7 +79,6 @@ pub struct Player {
     steps: usize,
     sequence_length: usize,
     seed: u64,
-    options: endless_gym_core::pool::OptionMap,
     /// The parts of each group that threads compute.
     parts: Vec<Vec<Part>>,
     sent: Vec<i32>,
@@ -123,7 +122,6 @@ impl Player {
             steps: settings.ppo.steps,
             sequence_length: settings.sequence_length(),
             seed: settings.seed,
-            options: settings.options()?,
             parts,
             sent: Vec::new(),
         })
@@ -253,7 +251,7 @@ impl Player {
                 self.segment.dones[row] = done;
                 self.state.starts[group * n + env] = done;
                 if done {
-                    self.state.episodes.push_back(final_infos(&self.environments.spec, &self.options, &batch, env));
+                    self.state.episodes.push_back(final_infos(&self.environments.spec, &batch, env));
                 }
             }
         }

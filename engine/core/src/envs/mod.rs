@@ -14,5 +14,7 @@ pub use environment::{Environment, InvalidState, Transition};
 pub use expert::Expert;
 pub use parameters::{Parameter, ParameterError, ParameterKind, ResetParameters};
 pub use progress::Progress;
-pub use spec::{ActionBranch, Choice, Column, EnvSpec, InfoColumn, ObservationSpace, UnknownEnvironment};
+pub use spec::{
+    ActionBranch, Choice, Column, EnvSpec, InfoColumn, Learnt, Metric, ObservationSpace, UnknownEnvironment,
+};
 pub use task::{Task, TaskEnv};

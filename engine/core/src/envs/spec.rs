@@ -3,10 +3,11 @@
 use std::fmt;
 
 use serde::Serialize;
+use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
 use super::action_space::ActionSpace;
-use super::parameters::Parameter;
+use super::parameters::{Parameter, ParameterError, ResetParameters};
 use crate::raster::FrameShape;
 
 /// One branch of an action.
@@ -45,6 +46,44 @@ pub struct InfoColumn {
     pub is_integer: bool,
     /// Meaning and unit.
     pub description: &'static str,
+}
+
+impl InfoColumn {
+    /// Task progress. Traces omit it, since the original does not return it.
+    pub const TASK_PROGRESS: InfoColumn =
+        InfoColumn { name: "task_progress", is_integer: false, description: "share of the task that was done, 0 to 1" };
+}
+
+/// The number of an episode by which agents are compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Metric {
+    /// Its name: `reward`, `length` or a column of the final info.
+    pub name: &'static str,
+    /// Label in plots.
+    pub label: &'static str,
+}
+
+impl Metric {
+    /// The sum of an episode's rewards.
+    pub const RETURN: Metric = Metric { name: "reward", label: "Return" };
+    /// [`InfoColumn::TASK_PROGRESS`].
+    pub const TASK_PROGRESS: Metric = Metric { name: InfoColumn::TASK_PROGRESS.name, label: "Task progress" };
+}
+
+/// When a task counts as learnt: the mean of a number over the last episodes reaches a share of the best possible one.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Learnt {
+    /// Name of the number, as in [`Metric::name`]. A task without a final info of that name never counts as learnt.
+    pub name: &'static str,
+    /// The least mean.
+    pub mean: f64,
+}
+
+impl Learnt {
+    /// At 0.9 of a final info from 0 to 1.
+    pub const fn by(name: &'static str) -> Self {
+        Learnt { name, mean: 0.9 }
+    }
 }
 
 /// Space of the feature observation, named after Gymnasium's spaces. In JSON as an [`ActionSpace`].
@@ -150,12 +189,22 @@ pub struct EnvSpec {
     pub keeps_state: bool,
     /// Reset parameters with their defaults and limits.
     pub parameters: &'static [Parameter],
+    /// The number by which agents are compared.
+    pub metric: Metric,
+    /// When the task counts as learnt; `None` for a task whose episodes get longer the better the agent is.
+    pub learnt: Option<Learnt>,
+    /// The maximum number of steps of an episode with these reset parameters; `None` without a limit.
+    #[serde(skip)]
+    pub step_limit: fn(&ResetParameters) -> Option<i64>,
     /// Frames per second for a human viewer.
     pub render_fps: u32,
 }
 
 impl EnvSpec {
     /// An id without frames, reset parameters, infos and features, at 25 frames per second. `summary` is the agent's task in one line.
+    ///
+    /// Its metric is the return, a final info `success` of 0.9 counts as learnt, and the step limit is the reset parameter `max_steps`,
+    /// unless that is missing or less than 1.
     pub const fn new(id: &'static str, summary: &'static str, action_space: ActionSpace) -> Self {
         EnvSpec {
             id,
@@ -172,8 +221,20 @@ impl EnvSpec {
             observation_space: None,
             keeps_state: false,
             parameters: &[],
+            metric: Metric::RETURN,
+            learnt: Some(Learnt::by("success")),
+            step_limit: |parameters| Some(parameters.int("max_steps", 0)).filter(|steps| *steps > 0),
             render_fps: 25,
         }
+    }
+
+    /// The maximum number of steps of an episode with the given reset parameters; `None` without a limit.
+    ///
+    /// # Errors
+    ///
+    /// [`ParameterError`] if a reset parameter is unknown, or has the wrong type or range.
+    pub fn max_episode_steps(&self, given: &Map<String, Json>) -> Result<Option<i64>, ParameterError> {
+        Ok((self.step_limit)(&ResetParameters::new(self.id, self.parameters, given)?))
     }
 }
 

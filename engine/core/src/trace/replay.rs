@@ -6,6 +6,7 @@ use serde_json::{Map, Value as Json};
 
 use super::format::{Trace, TraceError};
 use crate::batch::{Batch, Block, zeroed};
+use crate::envs::InfoColumn;
 use crate::pool::{Autoreset, EnvReset, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
 
 /// The outcome of a replay.
@@ -131,7 +132,8 @@ pub(super) fn info(pool: &Pool, blocks: &[Block], done: bool) -> Vec<(&'static s
         info.push(("reward", batch.episode_return().to_vec()));
         info.push(("length", vec![f64::from(batch.episode_length()[0])]));
         let columns = pool.spec().info.iter().zip(batch.info());
-        info.extend(columns.map(|(column, value)| (column.name, vec![*value])));
+        let original = columns.filter(|(column, _)| column.name != InfoColumn::TASK_PROGRESS.name);
+        info.extend(original.map(|(column, value)| (column.name, vec![*value])));
     }
     info
 }

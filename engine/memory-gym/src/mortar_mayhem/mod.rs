@@ -129,8 +129,10 @@ impl Environment for MortarMayhem {
     }
 
     fn info(&self, out: &mut [f64]) {
-        let endless = self.assets.config.variant.endless;
-        out.copy_from_slice(&if endless { self.state.endless_info() } else { self.state.finite_info() });
+        match self.assets.config.variant.endless {
+            true => out.copy_from_slice(&self.state.endless_info()),
+            false => out.copy_from_slice(&self.state.finite_info()),
+        }
     }
 
     fn expert(variant: Variant) -> Option<Box<dyn Expert>> {

@@ -7,10 +7,10 @@ use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION, Variant};
 use crate::controls::{MOVE, TURN_AND_WALK};
-use crate::screen::FRAME;
+use crate::screen::spec;
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::envs::Parameter;
-use endless_gym_core::envs::{Column, EnvSpec, InfoColumn};
+use endless_gym_core::envs::{ActionBranch, Column, EnvSpec, InfoColumn, Learnt, Metric};
 
 const AGENT_SCALE: Parameter = Parameter::float(
     "agent_scale",
@@ -140,6 +140,10 @@ const FINITE_INFO: &[InfoColumn] = &[
         is_integer: false,
         description: "share of the commands that were executed, 0 to 1",
     },
+    InfoColumn {
+        description: "share of the commands that were executed, 0 to 1, without a failed last command",
+        ..InfoColumn::TASK_PROGRESS
+    },
 ];
 
 const ENDLESS_INFO: &[InfoColumn] = &[
@@ -159,105 +163,101 @@ const GROUND_TRUTH: &[Column] = &[
     Column { name: "target_y", description: "row of that tile, from the top, divided by 5" },
 ];
 
+/// The specification of a finite id.
+const fn finite(
+    id: &'static str,
+    summary: &'static str,
+    action_space: ActionSpace,
+    actions: &'static [ActionBranch],
+) -> EnvSpec {
+    let mut spec = spec(id, summary, action_space, actions);
+    spec.info = FINITE_INFO;
+    spec.features = FEATURES;
+    spec.metric = Metric::TASK_PROGRESS;
+    spec.learnt = Some(Learnt::by(InfoColumn::TASK_PROGRESS.name));
+    // The most commands, each shown and executed for the longest time.
+    spec.step_limit = |given| {
+        let most = |name| given.int_list(name).into_iter().max().unwrap_or(0);
+        let (shown, burning) = (most("command_show_duration") + most("command_show_delay"), most("explosion_duration"));
+        Some((shown + burning + most("explosion_delay")) * most("command_count") - burning + 1)
+    };
+    spec
+}
+
 /// The five ids of the family.
 pub const IDS: &[(EnvSpec, Variant)] = &[
     (
-        EnvSpec {
-            id: "MortarMayhem-v0",
-            summary: "Memorise a sequence of shown commands, then walk it tile by tile",
-            action_space: ActionSpace::multi_discrete(&[3, 3]),
-            frame: Some(FRAME),
-            actions: MOVE,
-            vector_observation: 0,
-            ground_truth: &[],
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: FINITE_INFO,
-            features: FEATURES,
-            observation_space: None,
-            keeps_state: false,
-            parameters: MORTAR_MAYHEM,
-            render_fps: 25,
+        {
+            let mut spec = finite(
+                "MortarMayhem-v0",
+                "Memorise a sequence of shown commands, then walk it tile by tile",
+                ActionSpace::multi_discrete(&[3, 3]),
+                MOVE,
+            );
+            spec.parameters = MORTAR_MAYHEM;
+            spec
         },
         Variant { locomotion: Locomotion::Free, commands_given: false, endless: false, start_offset: false },
     ),
     (
-        EnvSpec {
-            id: "MortarMayhem-Grid-v0",
-            summary: "Mortar Mayhem with turning and walking from tile to tile",
-            action_space: ActionSpace::Discrete(4),
-            frame: Some(FRAME),
-            actions: TURN_AND_WALK,
-            vector_observation: 0,
-            ground_truth: &[],
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: FINITE_INFO,
-            features: FEATURES,
-            observation_space: None,
-            keeps_state: false,
-            parameters: MORTAR_MAYHEM_GRID,
-            render_fps: 6,
+        {
+            let mut spec = finite(
+                "MortarMayhem-Grid-v0",
+                "Mortar Mayhem with turning and walking from tile to tile",
+                ActionSpace::Discrete(4),
+                TURN_AND_WALK,
+            );
+            spec.parameters = MORTAR_MAYHEM_GRID;
+            spec.render_fps = 6;
+            spec
         },
         Variant { locomotion: Locomotion::Grid, commands_given: false, endless: false, start_offset: false },
     ),
     (
-        EnvSpec {
-            id: "MortarMayhemB-v0",
-            summary: "Mortar Mayhem without memory: the commands are always observed as a vector",
-            action_space: ActionSpace::multi_discrete(&[3, 3]),
-            frame: Some(FRAME),
-            actions: MOVE,
-            vector_observation: MAX_VECTOR_COMMANDS * COMMANDS,
-            ground_truth: &[],
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: FINITE_INFO,
-            features: FEATURES,
-            observation_space: None,
-            keeps_state: false,
-            parameters: MORTAR_MAYHEM_B,
-            render_fps: 25,
+        {
+            let mut spec = finite(
+                "MortarMayhemB-v0",
+                "Mortar Mayhem without memory: the commands are always observed as a vector",
+                ActionSpace::multi_discrete(&[3, 3]),
+                MOVE,
+            );
+            spec.vector_observation = MAX_VECTOR_COMMANDS * COMMANDS;
+            spec.parameters = MORTAR_MAYHEM_B;
+            spec
         },
         Variant { locomotion: Locomotion::Free, commands_given: true, endless: false, start_offset: true },
     ),
     (
-        EnvSpec {
-            id: "MortarMayhemB-Grid-v0",
-            summary: "Mortar Mayhem without memory, on a grid",
-            action_space: ActionSpace::Discrete(4),
-            frame: Some(FRAME),
-            actions: TURN_AND_WALK,
-            vector_observation: MAX_VECTOR_COMMANDS * COMMANDS,
-            ground_truth: &[],
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: FINITE_INFO,
-            features: FEATURES,
-            observation_space: None,
-            keeps_state: false,
-            parameters: MORTAR_MAYHEM_B_GRID,
-            render_fps: 1,
+        {
+            let mut spec = finite(
+                "MortarMayhemB-Grid-v0",
+                "Mortar Mayhem without memory, on a grid",
+                ActionSpace::Discrete(4),
+                TURN_AND_WALK,
+            );
+            spec.vector_observation = MAX_VECTOR_COMMANDS * COMMANDS;
+            spec.parameters = MORTAR_MAYHEM_B_GRID;
+            spec.render_fps = 1;
+            spec
         },
         Variant { locomotion: Locomotion::Grid, commands_given: true, endless: false, start_offset: false },
     ),
     (
-        EnvSpec {
-            id: "Endless-MortarMayhem-v0",
-            summary: "Each time the sequence is executed it grows by one shown command, until the agent fails",
-            action_space: ActionSpace::multi_discrete(&[3, 3]),
-            frame: Some(FRAME),
-            actions: MOVE,
-            vector_observation: 0,
-            ground_truth: GROUND_TRUTH,
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: ENDLESS_INFO,
-            features: FEATURES,
-            observation_space: None,
-            keeps_state: true,
-            parameters: ENDLESS_MORTAR_MAYHEM,
-            render_fps: 25,
+        {
+            let mut spec = spec(
+                "Endless-MortarMayhem-v0",
+                "Each time the sequence is executed it grows by one shown command, until the agent fails",
+                ActionSpace::multi_discrete(&[3, 3]),
+                MOVE,
+            );
+            spec.ground_truth = GROUND_TRUTH;
+            spec.info = ENDLESS_INFO;
+            spec.features = FEATURES;
+            spec.keeps_state = true;
+            spec.parameters = ENDLESS_MORTAR_MAYHEM;
+            spec.metric = Metric { name: "commands_completed", label: "Commands" };
+            spec.learnt = None;
+            spec
         },
         Variant { locomotion: Locomotion::Wrapping, commands_given: false, endless: true, start_offset: true },
     ),

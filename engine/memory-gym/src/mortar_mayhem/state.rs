@@ -154,10 +154,13 @@ impl State {
         }
     }
 
-    /// The final info of finite ids: success, and the share of commands that were executed.
-    pub(super) fn finite_info(&self) -> [f64; 2] {
-        let success = f64::from(u8::from(self.success));
-        [success, (self.current_command as f64 - 1.0 + success) / self.commands.len() as f64]
+    /// The final info of finite ids: success, and the share of commands that were executed, which counts a failed last command; and
+    /// the task progress, which does not.
+    pub(super) fn finite_info(&self) -> [f64; 3] {
+        let (success, commands) = (f64::from(u8::from(self.success)), self.commands.len() as f64);
+        let executed = self.current_command as f64 - 1.0 + success;
+        // An agent that leaves the tile too early fails at a command that is already counted.
+        [success, executed / commands, executed.min(self.total_completed as f64) / commands]
     }
 
     /// The final info of the endless id: commands executed, and the longest sequence.

@@ -127,7 +127,9 @@ impl Environment for MysteryPath {
 
     fn info(&self, out: &mut [f64]) {
         match self.assets.config.variant {
-            Variant::Free | Variant::Grid => out.copy_from_slice(&self.state.finite_info()),
+            Variant::Free | Variant::Grid => {
+                out.copy_from_slice(&self.state.finite_info(&self.assets.config.parameters))
+            }
             Variant::Endless => out.copy_from_slice(&self.state.endless_info()),
         }
     }

@@ -6,11 +6,11 @@
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
 use crate::controls::{FOLLOW, MOVE, TURN_AND_WALK};
-use crate::screen::FRAME;
 use crate::screen::SCREEN;
+use crate::screen::spec;
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::envs::Parameter;
-use endless_gym_core::envs::{Column, EnvSpec, InfoColumn};
+use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric};
 
 const fn max_steps(default: i64) -> Parameter {
     Parameter::int("max_steps", default, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1.")
@@ -106,6 +106,10 @@ const NUM_FAILS: InfoColumn =
 const FINITE_INFO: &[InfoColumn] = &[
     InfoColumn { name: "success", is_integer: true, description: "1 if the goal was reached, otherwise 0" },
     NUM_FAILS,
+    InfoColumn {
+        description: "share of the path's tiles that were reached, 0 to 1; `success` if they have no reward",
+        ..InfoColumn::TASK_PROGRESS
+    },
 ];
 
 const ENDLESS_INFO: &[InfoColumn] = &[
@@ -134,62 +138,54 @@ const GROUND_TRUTH: &[Column] = &[
 /// The three ids of the family.
 pub const IDS: &[(EnvSpec, Variant)] = &[
     (
-        EnvSpec {
-            id: "MysteryPath-v0",
-            summary: "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
-            action_space: ActionSpace::multi_discrete(&[3, 3]),
-            frame: Some(FRAME),
-            actions: MOVE,
-            vector_observation: 0,
-            ground_truth: &[],
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: FINITE_INFO,
-            features: FINITE_FEATURES,
-            observation_space: None,
-            keeps_state: false,
-            parameters: MYSTERY_PATH,
-            render_fps: 25,
+        {
+            let mut spec = spec(
+                "MysteryPath-v0",
+                "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
+                ActionSpace::multi_discrete(&[3, 3]),
+                MOVE,
+            );
+            spec.info = FINITE_INFO;
+            spec.features = FINITE_FEATURES;
+            spec.parameters = MYSTERY_PATH;
+            spec.metric = Metric::TASK_PROGRESS;
+            spec
         },
         Variant::Free,
     ),
     (
-        EnvSpec {
-            id: "MysteryPath-Grid-v0",
-            summary: "Mystery Path with turning and walking from tile to tile",
-            action_space: ActionSpace::Discrete(4),
-            frame: Some(FRAME),
-            actions: TURN_AND_WALK,
-            vector_observation: 0,
-            ground_truth: &[],
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: FINITE_INFO,
-            features: FINITE_FEATURES,
-            observation_space: None,
-            keeps_state: false,
-            parameters: MYSTERY_PATH_GRID,
-            render_fps: 3,
+        {
+            let mut spec = spec(
+                "MysteryPath-Grid-v0",
+                "Mystery Path with turning and walking from tile to tile",
+                ActionSpace::Discrete(4),
+                TURN_AND_WALK,
+            );
+            spec.info = FINITE_INFO;
+            spec.features = FINITE_FEATURES;
+            spec.parameters = MYSTERY_PATH_GRID;
+            spec.metric = Metric::TASK_PROGRESS;
+            spec.render_fps = 3;
+            spec
         },
         Variant::Grid,
     ),
     (
-        EnvSpec {
-            id: "Endless-MysteryPath-v0",
-            summary: "Follow an endless invisible path; a fall before the farthest column, or twice at the same tile, ends the episode",
-            action_space: ActionSpace::Discrete(4),
-            frame: Some(FRAME),
-            actions: FOLLOW,
-            vector_observation: 0,
-            ground_truth: GROUND_TRUTH,
-            ground_truth_is_integer: true,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: ENDLESS_INFO,
-            features: ENDLESS_FEATURES,
-            observation_space: None,
-            keeps_state: false,
-            parameters: ENDLESS_MYSTERY_PATH,
-            render_fps: 25,
+        {
+            let mut spec = spec(
+                "Endless-MysteryPath-v0",
+                "Follow an endless invisible path; a fall before the farthest column, or twice at the same tile, ends the episode",
+                ActionSpace::Discrete(4),
+                FOLLOW,
+            );
+            spec.ground_truth = GROUND_TRUTH;
+            spec.ground_truth_is_integer = true;
+            spec.info = ENDLESS_INFO;
+            spec.features = ENDLESS_FEATURES;
+            spec.parameters = ENDLESS_MYSTERY_PATH;
+            spec.metric = Metric { name: "tiles_visited", label: "Tiles" };
+            spec.learnt = None;
+            spec
         },
         Variant::Endless,
     ),

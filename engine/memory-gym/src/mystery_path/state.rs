@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::config::{Config, TILE, tile_at};
 use super::endless::EndlessState;
-use super::parameters::Variant;
+use super::parameters::{Parameters, Variant};
 use super::path::{Tile, TileSet};
 use super::route::Route;
 use crate::character::Character;
@@ -74,9 +74,11 @@ impl State {
         vec![Progress::share("tiles", tiles, self.route.tiles().len() as f64 - 1.0), falls]
     }
 
-    /// The final info of the finite ids: success, and the number of falls.
-    pub(super) fn finite_info(&self) -> [f64; 2] {
-        [f64::from(u8::from(self.success)), f64::from(self.fails)]
+    /// The final info of the finite ids: success, the number of falls, and the task progress.
+    pub(super) fn finite_info(&self, parameters: &Parameters) -> [f64; 3] {
+        let success = f64::from(u8::from(self.success));
+        let tiles = (f64::from(self.tiles_visited) + success) / (self.route.tiles().len() as f64 - 1.0);
+        [success, f64::from(self.fails), if parameters.reward_path_progress > 0.0 { tiles } else { success }]
     }
 
     /// The final info of the endless id: falls, the farthest column, and tiles visited.

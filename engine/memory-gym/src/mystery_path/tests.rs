@@ -53,6 +53,12 @@ impl Game {
         features
     }
 
+    fn info(&self) -> [f64; 3] {
+        let mut info = [0.0; 3];
+        self.env.info(&mut info);
+        info
+    }
+
     fn frame(&self) -> Vec<u8> {
         // The previous content must not matter.
         let mut frame = vec![77; FRAME.bytes()];
@@ -100,6 +106,7 @@ fn the_path_leads_to_the_goal_and_rewards_each_tile_once() {
     let mut game = Game::new(0, &json!({ "reward_path_progress": 1.0, "reward_goal": 100.0, "max_steps": -1 }), 5);
     let tiles = game.state().route.tiles().to_vec();
     game.walk_to(tiles[1]);
+    assert_eq!(game.info(), [0.0, 0.0, 1.0 / (tiles.len() - 1) as f64]);
     game.walk_to(tiles[0]);
     let mut reward = 1.0;
     for (number, tile) in tiles.iter().enumerate().skip(1) {
@@ -108,7 +115,7 @@ fn the_path_leads_to_the_goal_and_rewards_each_tile_once() {
         assert_eq!(transition.terminated, number == tiles.len() - 1);
     }
     assert_eq!(reward, 100.0 + (tiles.len() - 2) as f64);
-    assert_eq!(game.state().finite_info(), [1.0, 0.0]);
+    assert_eq!(game.info(), [1.0, 0.0, 1.0]);
 }
 
 #[test]
@@ -127,7 +134,7 @@ fn a_fall_shows_a_cross_and_leads_back() {
         game.step(&[2, 2]);
         assert_eq!(game.state().agent.position, start);
         assert!(!is_red(&game.frame()));
-        assert_eq!(game.state().finite_info(), [0.0, 1.0]);
+        assert_eq!(game.info()[..2], [0.0, 1.0]);
     }
 }
 

@@ -6,10 +6,10 @@
 use super::features::FEATURES;
 use super::parameters::{MAX_AGENT_SCALE, MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use crate::controls::MOVE;
-use crate::screen::FRAME;
+use crate::screen::spec;
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::envs::Parameter;
-use endless_gym_core::envs::{Column, EnvSpec, InfoColumn};
+use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric};
 
 const fn max_steps(default: i64) -> Parameter {
     const ANY: (i64, i64) = (i64::MIN, i64::MAX);
@@ -211,6 +211,10 @@ const FINITE_INFO: &[InfoColumn] = &[
         is_integer: true,
         description: "1 if the agent collected all coins and, if there is one, left by the exit",
     },
+    InfoColumn {
+        description: "share of the coins that were collected; with an exit, half for it and half for leaving. 0 to 1",
+        ..InfoColumn::TASK_PROGRESS
+    },
 ];
 
 const ENDLESS_INFO: &[InfoColumn] = &[
@@ -234,42 +238,38 @@ const GROUND_TRUTH: &[Column] = &[
 /// The two ids of the family.
 pub const IDS: &[(EnvSpec, Variant)] = &[
     (
-        EnvSpec {
-            id: "SearingSpotlights-v0",
-            summary: "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
-            action_space: ActionSpace::multi_discrete(&[3, 3]),
-            frame: Some(FRAME),
-            actions: MOVE,
-            vector_observation: 0,
-            ground_truth: &[],
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: FINITE_INFO,
-            features: FEATURES,
-            observation_space: None,
-            keeps_state: true,
-            parameters: SEARING_SPOTLIGHTS,
-            render_fps: 25,
+        {
+            let mut spec = spec(
+                "SearingSpotlights-v0",
+                "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
+                ActionSpace::multi_discrete(&[3, 3]),
+                MOVE,
+            );
+            spec.info = FINITE_INFO;
+            spec.features = FEATURES;
+            spec.keeps_state = true;
+            spec.parameters = SEARING_SPOTLIGHTS;
+            spec.metric = Metric::TASK_PROGRESS;
+            spec
         },
         Variant { endless: false },
     ),
     (
-        EnvSpec {
-            id: "Endless-SearingSpotlights-v0",
-            summary: "Collect one coin after the other in the dark, without being hit by moving spotlights",
-            action_space: ActionSpace::multi_discrete(&[3, 3]),
-            frame: Some(FRAME),
-            actions: MOVE,
-            vector_observation: 0,
-            ground_truth: GROUND_TRUTH,
-            ground_truth_is_integer: false,
-            ground_truth_bounds: Some((0.0, 1.0)),
-            info: ENDLESS_INFO,
-            features: FEATURES,
-            observation_space: None,
-            keeps_state: true,
-            parameters: ENDLESS_SEARING_SPOTLIGHTS,
-            render_fps: 25,
+        {
+            let mut spec = spec(
+                "Endless-SearingSpotlights-v0",
+                "Collect one coin after the other in the dark, without being hit by moving spotlights",
+                ActionSpace::multi_discrete(&[3, 3]),
+                MOVE,
+            );
+            spec.ground_truth = GROUND_TRUTH;
+            spec.info = ENDLESS_INFO;
+            spec.features = FEATURES;
+            spec.keeps_state = true;
+            spec.parameters = ENDLESS_SEARING_SPOTLIGHTS;
+            spec.metric = Metric { name: "coins_collected", label: "Coins" };
+            spec.learnt = None;
+            spec
         },
         Variant { endless: true },
     ),

@@ -173,11 +173,14 @@ impl State {
         vec![coins, Progress::share("health", self.health, config.parameters.agent_health)]
     }
 
-    /// The final info of the finite id: share of health, share of coins, success. The share of coins is NaN without
+    /// The final info of the finite id: share of health, share of coins, success, task progress. The share of coins is NaN without
     /// coins, as in the original.
-    pub(super) fn finite_info(&self, parameters: &Parameters) -> [f64; 3] {
-        let coins = f64::from(self.coins_collected) / self.num_coins as f64;
-        [self.health_share(parameters), coins, f64::from(u8::from(self.success))]
+    pub(super) fn finite_info(&self, parameters: &Parameters) -> [f64; 4] {
+        let (coins, success) =
+            (f64::from(self.coins_collected) / self.num_coins as f64, f64::from(u8::from(self.success)));
+        let collected = if self.num_coins == 0 { 1.0 } else { coins };
+        let progress = if parameters.use_exit { (collected + success) / 2.0 } else { collected };
+        [self.health_share(parameters), coins, success, progress]
     }
 
     /// The final info of the endless id: share of health, number of coins.

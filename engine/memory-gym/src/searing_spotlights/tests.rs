@@ -144,11 +144,13 @@ fn without_an_exit_the_last_coin_wins() {
     assert_eq!(environment.state.exit, None);
     let coin = environment.state.coins[0];
     assert_eq!(walk(&mut environment, &mut random, coin), (0.25, false));
+    let mut info = [0.0; 4];
+    environment.info(&mut info);
+    assert_eq!(info, [1.0, 0.5, 0.0, 0.5]);
     let coin = environment.state.coins[0];
     assert_eq!(walk(&mut environment, &mut random, coin), (0.25, true));
-    let mut info = [0.0; 3];
     environment.info(&mut info);
-    assert_eq!(info, [1.0, 1.0, 1.0]);
+    assert_eq!(info, [1.0; 4]);
 }
 
 #[test]
@@ -160,9 +162,9 @@ fn without_coins_the_exit_is_open() {
     environment.step(&[0, 0], &mut random);
     assert_eq!(features(&environment)[EXIT + 3], 1.0);
     assert_eq!(walk(&mut environment, &mut random, exit), (1.0, true));
-    let mut info = [f64::NAN; 3];
+    let mut info = [f64::NAN; 4];
     environment.info(&mut info);
-    assert_eq!((info[0], info[2]), (1.0, 1.0));
+    assert_eq!((info[0], info[2], info[3]), (1.0, 1.0, 1.0));
     assert!(info[1].is_nan(), "0 of 0 coins, which is NaN in the original");
     assert!(FINITE.info[1].description.ends_with("; NaN if the episode had no coins"));
 }
