@@ -1,4 +1,4 @@
-//! How many cases the property tests of this crate run.
+//! How many cases the property tests of this crate and of `memory-gym` run.
 
 use proptest::prelude::ProptestConfig;
 

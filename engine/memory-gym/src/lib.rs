@@ -15,6 +15,7 @@ pub mod searing_spotlights;
 mod vector;
 
 #[cfg(test)]
+#[path = "../../core/src/property_cases.rs"]
 mod property_cases;
 
 use std::sync::LazyLock;
