@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from endless_gym.specs import all_specs
 from endless_gym_agents import checkpoint, enjoy, export, plot, ppo, protocol
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.clock import Clock
@@ -27,6 +29,7 @@ from endless_gym_agents.evaluate import evaluate
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.rollout import RolloutCollector
 from endless_gym_agents.run_folder import RunInUse, locked
+from endless_gym_agents.settings import PAPER_STEPS_PER_UPDATE, PRESETS, Settings, paper_run_length, value
 from endless_gym_agents.train import parse, train
 
 #: A segment, and so a minibatch, of one step.
@@ -278,3 +281,66 @@ def test_a_run_in_a_served_engine_outlives_the_engine(tmp_path: Path) -> None:
     with serving(name):
         error = learn(f"MortarMayhem-Grid-v0 --connect {name} --run {tmp_path / 'other'}", fails=True)
     assert "must serve 2 groups of 4 environments MortarMayhem-Grid-v0 with autoreset same_step" in error
+
+
+def learn_each(commands: list[list[str]]) -> list[str]:
+    """What `endless learn` prints for each of several lists of arguments."""
+    code = "import json, sys; from endless_gym import _native\n"
+    code += "for given in json.load(sys.stdin): print('=====', flush=True); _native.endless(['learn', *given], [])"
+    process = subprocess.run(
+        [sys.executable, "-c", code],
+        input=json.dumps(commands),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
+    )
+    return process.stdout.split("=====\n")[1:]
+
+
+def described(*arguments: str) -> dict[str, str]:
+    """The options of `endless learn` that `endless-train` has, too: what `--help` says of each, by its name in `Settings`."""
+    (text,) = learn_each([[*arguments, "--help"]])
+    options = re.findall(r"^ +(?:-\w, )?--([\w.-]+)(.*?)(?=^ +(?:-\w, )?--|\Z)", text, re.DOTALL | re.MULTILINE)
+    found = {name.replace("-", "_"): text for name, text in options}
+    for name in ("connect", "log", "help"):
+        del found[name]
+    assert len(found) > 35
+    return found
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_defaults_and_presets_are_those_of_the_python_agents(preset: str) -> None:
+    # The trainer in Rust always takes features, and steps on the thread that acts.
+    others = ("preset", "environment.observation", "environment.num_threads")
+    for name, text in described("--preset", preset).items():
+        expected, found = value(PRESETS[preset], name), re.search(r"\[default: (.*?)\]", text, re.DOTALL)
+        if name not in others and expected not in ("", (), None):
+            assert found is not None, name
+            given = found[1] if isinstance(expected, str) else json.loads(found[1])
+            assert given == expected, name
+
+
+def test_ranges_are_those_of_the_python_agents() -> None:
+    commands, expected = [], []
+    for name in described():
+        group, _, field = name.rpartition(".")
+        owner = type(value(Settings(), group)) if group else Settings
+        hint = get_type_hints(owner, include_extras=True)[field]
+        for allowed in getattr(hint, "__metadata__", ()):
+            step = 1 if isinstance(value(Settings(), name), int) else 1e-6
+            numbers = {end + way * step for end in (allowed.low, allowed.high) for way in (-1, 0, 1)} | {float("nan")}
+            for number in numbers:
+                commands.append([f"--{name.replace('_', '-')}={number}", "--preset=unknown"])
+                expected.append(number in allowed)
+    assert len(commands) > 100
+    for command, output, is_allowed in zip(commands, learn_each(commands), expected, strict=True):
+        assert ("'unknown' for '--preset" in output) is is_allowed, (command, output)
+
+
+def test_runs_are_as_long_as_those_of_the_python_agents(tmp_path: Path) -> None:
+    small = f"{ONE_STEP} --ppo.updates 0 --ppo.minibatches 1 --recurrence.hidden-size 1 --time-limit 1e-9".split()
+    cases = [(id, agent) for id in all_specs() if "popgym" not in id for agent in ("gru", "mingru", "none")]
+    commands = [[id, "--agent", agent, "--run", str(tmp_path / f"{id}-{agent}"), *small] for id, agent in cases]
+    for case, output in zip(cases, learn_each(commands), strict=True):
+        assert f"1 of {paper_run_length(*case) * PAPER_STEPS_PER_UPDATE} updates done" in output, output
