@@ -22,6 +22,7 @@ from typing import Any
 import torch
 import tyro
 
+from endless_gym._native import PAGE_AGENTS
 from endless_gym.create import make_vec
 from endless_gym.printable import printable
 from endless_gym.specs import spec
@@ -32,8 +33,6 @@ from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.ranges import Positive
 from endless_gym_agents.settings import Settings, to_dict
 
-#: The agents that the page can compute.
-PAGE_AGENTS = ("gru", "mingru", "gated-deltanet", "mamba2", "retnet", "none")
 #: Seed of the episodes and of the sampled actions of recorded vectors.
 VECTORS_SEED = 200_000
 

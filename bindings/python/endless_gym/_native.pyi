@@ -11,6 +11,8 @@ __version__: str
 # Names of the autoreset modes: those of Gymnasium's `AutoresetMode` in lower case.
 AUTORESET_MODES: tuple[str, ...]
 DEFAULT_ENV_ID: str
+# Names of the agents that the page plays.
+PAGE_AGENTS: tuple[str, ...]
 # Limits: environments in a group, groups, threads, and batches of a group that a trainer may hold.
 MAX_ENVS: int
 MAX_GROUPS: int

@@ -74,6 +74,8 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(kernels::lstm_backward, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::mingru_forward, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::mingru_backward, module)?)?;
+    let agents = endless_gym_kernels::file::PAGE_AGENTS.map(|(name, _)| name);
+    module.add("PAGE_AGENTS", PyTuple::new(module.py(), agents)?)?;
     populate(module, Ok(endless_gym::environments().clone()))
 }
 

@@ -17,6 +17,16 @@ const CHECKSUM: &str = "crc32";
 /// seconds to read.
 const MAX_DESCRIPTION: u64 = 4 << 20;
 
+/// The agents whose files the page plays, and what a sentence calls each.
+pub const PAGE_AGENTS: [(&str, &str); 6] = [
+    ("gru", "A GRU"),
+    ("mingru", "A minGRU"),
+    ("gated-deltanet", "A Gated DeltaNet"),
+    ("mamba2", "A Mamba-2"),
+    ("retnet", "A RetNet"),
+    ("none", "An agent without memory"),
+];
+
 /// Why a file cannot be read; the text says it of the file.
 #[derive(Debug, Error)]
 pub enum FileError {

@@ -3,11 +3,6 @@
 /** The environments with a trained agent of the page, in the file ID.safetensors; docs/train/agents.md describes how to make one. */
 const IDS = ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0"];
 
-/** Names of the agents in sentences. */
-const KINDS = {
-  gru: "A GRU", mingru: "A minGRU", "gated-deltanet": "A Gated DeltaNet", mamba2: "A Mamba-2", retnet: "A RetNet", none: "An agent without memory",
-};
-
 export class Agents {
   #loaded = new Map();
   #counts = new Map();
@@ -69,7 +64,7 @@ export class Agents {
 
   /** One sentence about the training. */
   trained(id) {
-    const { agent, steps, evaluation } = this.description(id);
+    const { title, steps, evaluation } = this.description(id);
     // Endless environments have no success.
     const share = ({ options, success, mean_reward: mean }) => {
       const given = Object.entries(options).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`);
@@ -77,7 +72,7 @@ export class Agents {
       return score + (given.length ? ` with ${given.join(" and ")}` : "");
     };
     const measured = evaluation.map((result) => `; ${share(result)}`).join("");
-    return `${KINDS[agent]}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
+    return `${title}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
   }
 }
 

@@ -7,7 +7,7 @@ mod tests;
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::random::{Generator, SeedSequence};
 use endless_gym_kernels::categorical;
-use endless_gym_kernels::file::{self, File, FileError};
+use endless_gym_kernels::file::{self, File, FileError, PAGE_AGENTS};
 use endless_gym_kernels::network::{Memory as Layers, Network, NetworkSpec, Pass};
 use endless_gym_kernels::sequences::Sequences;
 use linear_attention::{Kind, Sizes, Stack, State};
@@ -29,7 +29,7 @@ pub enum AgentFileError {
     WeightsOnly,
     #[error("the header of an agent cannot be read: {0}")]
     Header(#[from] serde_json::Error),
-    #[error("an agent on the page must be gru, mingru, gated-deltanet, mamba2, retnet or none, got {given}")]
+    #[error("an agent on the page must be one of {}, got {given}", PAGE_AGENTS.map(|(name, _)| name).join(", "))]
     Kind { given: String },
     #[error("the agent must have a float32 tensor `{name}` of shape {expected}, got {given}")]
     Tensor { name: String, expected: String, given: String },
@@ -158,6 +158,7 @@ impl Agent {
         json!({
             "env": env,
             "agent": agent,
+            "title": PAGE_AGENTS.iter().find(|(name, _)| name == agent).map(|(_, title)| title),
             "options": options,
             "updates": update,
             "steps": steps,

@@ -171,7 +171,7 @@ fn a_broken_file_is_refused() {
     let kind = replaced(r#"\"agent\":\"gru\""#, r#"\"agent\":\"abc\""#);
     assert_eq!(
         kind.to_string(),
-        "an agent on the page must be gru, mingru, gated-deltanet, mamba2, retnet or none, got abc"
+        "an agent on the page must be one of gru, mingru, gated-deltanet, mamba2, retnet, none, got abc"
     );
     let bias = replaced("\"memory.embedding.0.bias\"", "\"memory.embedding.9.bias\"");
     let text = "the agent must have a float32 tensor `memory.embedding.0.bias` of shape [48], got none";
