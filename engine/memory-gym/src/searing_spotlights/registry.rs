@@ -212,7 +212,7 @@ const FINITE_INFO: &[InfoColumn] = &[
         description: "1 if the agent collected all coins and, if there is one, left by the exit",
     },
     InfoColumn {
-        description: "share of the coins that were collected; with an exit, half for it and half for leaving. 0 to 1",
+        description: "share of the coins that were collected; with an exit, half of it plus half for leaving. 0 to 1",
         ..InfoColumn::TASK_PROGRESS
     },
 ];
