@@ -1,7 +1,7 @@
 """`endless-enjoy`: record a video of a trained agent, with its frames next to the ground-truth view.
 
 ```console
-endless-enjoy runs/mine                                        # one episode, as a GIF
+endless-enjoy runs/mine                                        # one episode, as animated WebP
 endless-enjoy runs/mine --seeds 200000 200001 --out play.mp4   # several, as MP4 (needs ffmpeg)
 ```
 """
@@ -34,8 +34,8 @@ class EnjoyArguments:
     """a checkpoint file, or the folder of a run for its last checkpoint"""
     seeds: Annotated[tuple[int, ...], Range(0)] = (EVALUATION_SEEDS.start,)
     """seeds of the episodes, which are shown in order"""
-    out: Path = Path("episode.gif")
-    """output file, .gif (256 colours per frame), .webp (lossless) or .mp4"""
+    out: Path = Path("episode.webp")
+    """output file, .webp (lossless) or .mp4 (needs ffmpeg)"""
     action_seed: Natural = 0
     """seed of the action sampling"""
     greedy: bool = False
@@ -109,7 +109,6 @@ def execute(arguments: EnjoyArguments) -> None:
     """Record the video, and print the reward and length of each episode."""
     if not arguments.seeds:
         raise ValueError("--seeds must contain at least one seed, got none")
-    video.check(arguments.out)
     command.check_outputs([arguments.out], checkpoint.protected(arguments.checkpoint))
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)

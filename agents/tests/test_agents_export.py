@@ -142,13 +142,13 @@ def test_what_is_read_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.Mon
     (run / "settings.json").write_text("{}")
     (run / "checkpoints" / "update-000001.pt").write_text("an earlier one")
     last = run / "checkpoints" / "last.pt"
-    os.link(last, tmp_path / "linked.gif")
+    os.link(last, tmp_path / "linked.webp")
     (tmp_path / "symbolic.json").symlink_to(last)
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     monkeypatch.chdir(run)
-    for source in (run, Path("."), last, tmp_path / "linked.gif"):
+    for source in (run, Path("."), last, tmp_path / "linked.webp"):
         with pytest.raises(ValueError, match=r"cannot write .*, which is the file .*; choose another file"):
-            export.execute(export.ExportArguments(source, weights=tmp_path / "linked.gif"))
+            export.execute(export.ExportArguments(source, weights=tmp_path / "linked.webp"))
     for out in ("checkpoints/last.pt", last, "checkpoints/update-000001.pt", "settings.json", "../symbolic.json"):
         for execute in (
             lambda out: export.execute(export.ExportArguments(run, weights=Path(out))),
@@ -158,8 +158,8 @@ def test_what_is_read_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.Mon
         ):
             with pytest.raises(ValueError, match="cannot write"):
                 execute(out)
-    with pytest.raises(ValueError, match=r"cannot write .*linked\.gif"):
-        enjoy.execute(enjoy.EnjoyArguments(run, out=tmp_path / "linked.gif"))
+    with pytest.raises(ValueError, match=r"cannot write .*linked\.webp"):
+        enjoy.execute(enjoy.EnjoyArguments(run, out=tmp_path / "linked.webp"))
     with pytest.raises(ValueError, match="cannot write"):
         export.execute(export.ExportArguments(run, weights=Path("a"), vectors=Path("../run/a")))
     assert before == {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}

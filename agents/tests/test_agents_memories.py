@@ -59,7 +59,7 @@ def test_the_programs_take_a_memory(
     assert "retnet_64" in capsys.readouterr().out
     assert run(plot.main, "results.json", "--out", "plots") == 0
     assert list(Path("plots").glob("*.png"))
-    assert run(enjoy.main, "runs/one", "--seeds", "200000", "--max-steps", "4", "--out", "episode.gif") == 0
+    assert run(enjoy.main, "runs/one", "--seeds", "200000", "--max-steps", "4", "--out", "episode.webp") == 0
     capsys.readouterr()
     assert run(probe.main, "runs/one", "--episodes", "5", "--max-steps", "10", "--json") == 0
     assert json.loads(capsys.readouterr().out)

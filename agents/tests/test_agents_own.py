@@ -52,7 +52,7 @@ def test_the_commands_of_the_page_work(
     assert label(given) == ("MinGRU_layers=2", "gru_128_Impala_channels=[4, 8]", "gru_128_StepPenalty")[number]
     assert label(given) in capsys.readouterr().out
     assert len(read_progress(run)) == blocks("sh")[number].count("endless-train")
-    assert number or Path("episode.gif").stat().st_size > 0
+    assert number or Path("episode.webp").stat().st_size > 0
     own = (given.agent, given.encoder, *given.environment.wrapper)[number]
     assert own == str(file.parent / ("min_gru.py:MinGRU", "impala.py:Impala", "penalty.py:StepPenalty")[number])
     # From another folder.

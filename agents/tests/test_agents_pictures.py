@@ -3,12 +3,15 @@
 import csv
 import json
 import stat
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from agents_helpers import settings
+from numpy.typing import NDArray
 from PIL import Image
 
 from endless_gym.env import Env
@@ -47,24 +50,25 @@ def test_frame_shows_the_picture_next_to_the_view() -> None:
     assert (picture[336:] == video._TEXT_COLOUR).all(-1).any()
 
 
-def test_gif_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "video.gif"
+def test_webp_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "video.webp"
     enjoy.execute(enjoy.EnjoyArguments(run, seeds=(200_000, 200_003), out=out))
     lengths = [int(line.split(" in ")[1].split()[0]) for line in capsys.readouterr().out.splitlines()[:2]]
     assert min(lengths) > 0
     with Image.open(out) as image:
         assert image.size == (video.WIDTH, video.HEIGHT)
-        # One frame for the start and for each step; the repeated last frame of an episode is merged.
-        assert image.n_frames == sum(lengths) + 2
-        for place, seed in ((0, 200_000), (lengths[0] + 1, 200_003)):
+        # One frame for the start and for each step; the last one of an episode stays for a second.
+        fps = spec(GRID).render_fps
+        assert image.n_frames == sum(lengths) + 2 + 2 * fps
+        for place, seed in ((0, 200_000), (lengths[0] + 1 + fps, 200_003)):
             env = Env(GRID, render_mode="debug_rgb_array", options={"command_count": [1]})
             observation, _ = env.reset(seed=seed)
             image.seek(place)
             shown = rgb(image)
             assert (shown[:336:4, :336:4] == observation.swapaxes(0, 1)).all()
             assert (shown[:336, 344:] == env.render()).all()
-        assert image.info["duration"] == pytest.approx(1000 / spec(GRID).render_fps, rel=0.1)
-    assert [file.name for file in tmp_path.iterdir()] == ["video.gif"]
+        assert image.info["duration"] == 1000 / fps
+    assert [file.name for file in tmp_path.iterdir()] == ["video.webp"]
 
 
 def test_webp_shows_every_pixel(tmp_path: Path) -> None:
@@ -72,18 +76,13 @@ def test_webp_shows_every_pixel(tmp_path: Path) -> None:
     frames = list(enjoy.EpisodeRecorder(agent, 0, max_steps=12).frames((5,)))
     # Random noise contains every colour, and hardly any equal neighbours.
     frames.append(np.random.default_rng(0).integers(256, size=frames[0].shape, dtype=np.uint8))
-    distinct = [frame for at, frame in enumerate(frames) if at == 0 or not np.array_equal(frame, frames[at - 1])]
     video.write(tmp_path / "video.webp", frames, 25)
     with Image.open(tmp_path / "video.webp") as image:
-        # A repeated frame is merged with the one before.
-        assert image.n_frames in (len(distinct), len(frames))
-        expected = distinct if image.n_frames == len(distinct) else frames
-        duration = 0
-        for place, frame in enumerate(expected):
+        assert image.n_frames == len(frames)
+        for place, frame in enumerate(frames):
             image.seek(place)
             assert np.array_equal(rgb(image), frame), place
-            duration += image.info["duration"]
-    assert duration == 40 * len(frames)
+            assert image.info["duration"] == 40
 
 
 def test_video_is_reproducible() -> None:
@@ -114,13 +113,31 @@ def test_mp4_is_piped_to_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["bin", "video.mp4"]
 
 
-def test_interrupted_video_leaves_no_file(tmp_path: Path) -> None:
-    def pictures() -> object:
-        yield np.zeros((video.HEIGHT, video.WIDTH, 3), np.uint8)
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("name", "frames", "message"),
+    [
+        ("video.gif", 1, "name must end in .webp or .mp4, got `.*video.gif`"),
+        ("none/video.webp", 1, "cannot write .*none/video.webp: No such file"),
+        ("video.mp4", 1, "an .mp4 needs ffmpeg, and there is no program `ffmpeg`"),
+        ("video.webp", 0, "a film needs at least one frame"),
+        ("video.webp", 2, r"all frames uint8 \(height, width, 3\) of one size, got 25 and \[4, 6, 3\]"),
+        ("video.webp", 3, "interrupted"),
+    ],
+)
+def test_failed_video_leaves_no_file(
+    name: str, frames: int, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))  # without ffmpeg
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
 
-    with pytest.raises(KeyboardInterrupt):
-        video.write(tmp_path / "video.gif", pictures(), 25)
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        for count in range(frames):
+            if count == 2:
+                raise KeyboardInterrupt("interrupted")
+            yield np.zeros((4, 5 + count * (frames == 2), 3), np.uint8)
+
+    with pytest.raises((OSError, ValueError, KeyboardInterrupt), match=message):
+        video.write(tmp_path / name, pictures(), 25)
     assert list(tmp_path.iterdir()) == []
 
 

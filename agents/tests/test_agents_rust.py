@@ -120,7 +120,7 @@ def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_an_episode_of_a_run_is_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, picture = new_run(tmp_path / "run", "--agent mingru --ppo.updates 1"), tmp_path / "episode.gif"
+    run, picture = new_run(tmp_path / "run", "--agent mingru --ppo.updates 1"), tmp_path / "episode.webp"
     monkeypatch.setattr(sys, "argv", ["endless-enjoy", str(run), "--seeds", "200000", "--out", str(picture)])
     assert enjoy.main() == 0 and picture.stat().st_size > 1_000
 

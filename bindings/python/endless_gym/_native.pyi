@@ -1,6 +1,7 @@
 """Types of the native module, which the package wraps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
@@ -113,6 +114,7 @@ def ended_episodes(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.int32], list[NDArray[Any]]] | None: ...
 def endless(arguments: Sequence[str], executable: Sequence[str]) -> int: ...
 def max_episode_steps(id: str, options: str) -> int: ...
+def write_film(path: str | PathLike[str], frames: Iterable[NDArray[np.uint8]], fps: int) -> None: ...
 def specs() -> str: ...
 
 # The kernels of `endless-gym-kernels`: contiguous float32 arrays, of which the last ones are overwritten, as that crate says.

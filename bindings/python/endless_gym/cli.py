@@ -14,7 +14,7 @@ def _is_film(arguments: list[str]) -> bool:
     return any(argument.partition("=")[0] == "--film" for argument in arguments)
 
 
-def _find_ffmpeg() -> None:
+def find_ffmpeg() -> None:
     """Let the program use the ffmpeg of the package imageio-ffmpeg if the system has none."""
     if "IMAGEIO_FFMPEG_EXE" in os.environ or shutil.which("ffmpeg"):
         return
@@ -33,7 +33,7 @@ def main() -> int:
 
         return command.main(sys.argv[2:])
     if sys.argv[1:2] == ["record"]:
-        _find_ffmpeg()
+        find_ffmpeg()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     return _native.endless(sys.argv[1:], program())

@@ -19,6 +19,8 @@ mod ends;
 mod errors;
 mod experts;
 #[cfg(feature = "native")]
+mod films;
+#[cfg(feature = "native")]
 mod kernels;
 mod logs;
 mod observer;
@@ -68,6 +70,7 @@ fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) 
 #[cfg(feature = "native")]
 #[pymodule(name = "_native")]
 fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_function(wrap_pyfunction!(films::write_film, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::gru_forward, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::gru_backward, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::lstm_forward, module)?)?;

@@ -50,7 +50,7 @@ def test_notebook_runs(tmp_path: Path, libraries_python: str) -> None:
     outputs = [output for cell in cells for output in cell.get("outputs", [])]
     kinds = Counter(kind for output in outputs for kind in output.get("data", {}))
     assert kinds["image/png"] == 3, "the environments, a vector environment, the learning curve"
-    assert kinds["image/gif"] == 1, "the film"
+    assert kinds["image/webp"] == 1, "the film"
     printed = "".join("".join(output["text"]) for output in outputs if output["output_type"] == "stream")
     assert re.search(r"[1-9]\d* of 2000 updates done", printed)
     assert "Traceback" not in printed

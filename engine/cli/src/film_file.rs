@@ -1,4 +1,4 @@
-//! Film files: GIF, animated WebP, animated PNG, and MP4 through ffmpeg.
+//! Film files: animated WebP, and MP4 through ffmpeg.
 
 use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Read, Write};
@@ -6,38 +6,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use super::failure::Failure;
-use super::film_picture::{Picture, magnified};
+use super::film_picture::magnified;
 use super::film_webp::WebpFilm;
 
 /// The environment variable that names the program ffmpeg, the same as for the Python package imageio-ffmpeg.
 const FFMPEG: &str = "IMAGEIO_FFMPEG_EXE";
-
-/// The format of a film file.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Format {
-    /// With a palette of 256 colours for each picture.
-    Gif,
-    /// Animated WebP, lossless.
-    Webp,
-    /// Animated PNG, lossless.
-    Png,
-    /// H.264 or whatever ffmpeg chooses, lossy.
-    Mp4,
-}
-
-impl Format {
-    /// The format for a file name's suffix.
-    pub fn of(file: &Path) -> Result<Self, Failure> {
-        let suffix = file.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        match suffix.as_str() {
-            "gif" => Ok(Format::Gif),
-            "webp" => Ok(Format::Webp),
-            "png" => Ok(Format::Png),
-            "mp4" => Ok(Format::Mp4),
-            _ => Err(format!("--film must end in .gif, .webp, .png or .mp4, got `{}`", file.display()).into()),
-        }
-    }
-}
 
 /// Properties that all pictures of a film share.
 #[derive(Clone, Copy, Debug)]
@@ -48,14 +21,12 @@ pub struct Shape {
     pub scale: usize,
     /// Pictures per second.
     pub fps: u16,
-    /// Number of pictures; only [`Format::Png`] needs it.
-    pub pictures: u32,
 }
 
 enum Encoder {
-    Gif(gif::Encoder<BufWriter<File>>),
+    /// Lossless.
     Webp(WebpFilm<BufWriter<File>>),
-    Png(png::Writer<BufWriter<File>>),
+    /// H.264 or whatever ffmpeg chooses, lossy.
     Mp4(Child),
 }
 
@@ -70,49 +41,39 @@ pub struct FilmFile {
 }
 
 impl FilmFile {
-    /// Starts a file of the format that `path` names.
+    /// Starts a file of the format that the suffix of `path` names.
+    ///
+    /// # Errors
+    ///
+    /// If the suffix is another one, the folder cannot be written, or ffmpeg does not start.
     pub fn create(path: &Path, shape: Shape) -> Result<Self, Failure> {
-        let format = Format::of(path)?;
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
         let suffix = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        if !["webp", "mp4"].contains(&suffix.as_str()) {
+            return Err(format!("a film's name must end in .webp or .mp4, got `{}`", path.display()).into());
+        }
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
         let partial = path.with_file_name(format!(".{name}.{}.partial.{suffix}", std::process::id()));
-        // Also for ffmpeg, so that an unwritable folder gives the same error for all formats.
+        // Also for ffmpeg, so that an unwritable folder gives the same error for both formats.
         let created = File::create(&partial).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
         let mut film = FilmFile { encoder: None, shape, duration: 0, partial, path: path.to_owned() };
-        film.encoder = Some(film.encoder(format, BufWriter::new(created))?);
+        let (width, height) = (shape.size.0 * shape.scale, shape.size.1 * shape.scale);
+        film.encoder = Some(if suffix == "mp4" {
+            Encoder::Mp4(film.ffmpeg(&format!("{width}x{height}"))?)
+        } else {
+            Encoder::Webp(WebpFilm::new(BufWriter::new(created), (u32::try_from(width)?, u32::try_from(height)?))?)
+        });
         Ok(film)
     }
 
-    fn encoder(&self, format: Format, file: BufWriter<File>) -> Result<Encoder, Failure> {
-        let Shape { size: (width, height), scale, fps, pictures } = self.shape;
-        let (width, height) = (width * scale, height * scale);
-        Ok(match format {
-            Format::Gif => {
-                let mut encoder = gif::Encoder::new(file, u16::try_from(width)?, u16::try_from(height)?, &[])?;
-                encoder.set_repeat(gif::Repeat::Infinite)?;
-                Encoder::Gif(encoder)
-            }
-            Format::Webp => Encoder::Webp(WebpFilm::new(file, (u32::try_from(width)?, u32::try_from(height)?))?),
-            Format::Png => {
-                let mut encoder = png::Encoder::new(file, u32::try_from(width)?, u32::try_from(height)?);
-                encoder.set_color(png::ColorType::Rgb);
-                encoder.set_depth(png::BitDepth::Eight);
-                encoder.set_animated(pictures, 0)?;
-                Encoder::Png(encoder.write_header()?)
-            }
-            Format::Mp4 => Encoder::Mp4(self.ffmpeg(&format!("{width}x{height}"), fps)?),
-        })
-    }
-
-    fn ffmpeg(&self, size: &str, fps: u16) -> Result<Child, Failure> {
+    fn ffmpeg(&self, size: &str) -> Result<Child, Failure> {
         let program = std::env::var_os(FFMPEG).unwrap_or_else(|| "ffmpeg".into());
         let mut command = Command::new(&program);
         command.args(["-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r"]);
-        command.arg(fps.to_string()).args(["-i", "-", "-pix_fmt", "yuv420p"]).arg(&self.partial);
+        command.arg(self.shape.fps.to_string()).args(["-i", "-", "-pix_fmt", "yuv420p"]).arg(&self.partial);
         let child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn();
         child.map_err(|error| match error.kind() {
             ErrorKind::NotFound => format!(
-                "an .mp4 needs ffmpeg, and there is no program `{}`: install it, or let {FFMPEG} name it, or use .gif, .webp or .png",
+                "an .mp4 needs ffmpeg, and there is no program `{}`: install it, or let {FFMPEG} name it, or use .webp",
                 program.display()
             )
             .into(),
@@ -120,32 +81,23 @@ impl FilmFile {
         })
     }
 
-    /// Adds a picture that is shown for `count` picture durations, 1 or more.
-    pub fn add(&mut self, picture: &Picture, count: u16) -> Result<(), Failure> {
-        let Shape { scale, fps, .. } = self.shape;
+    /// Adds a picture, RGB pixels in rows, that is shown for `count` picture durations, 1 or more.
+    ///
+    /// # Errors
+    ///
+    /// If the picture cannot be encoded or written.
+    pub fn add(&mut self, pixels: &[[u8; 3]], count: u16) -> Result<(), Failure> {
+        let Shape { size: (width, _), scale, fps } = self.shape;
         let (start, end) = (self.duration, self.duration + u64::from(count));
         self.duration = end;
-        // Rounding errors do not add up: the whole film has the right duration.
-        let time = |pictures: u64, unit: u64| (pictures * unit + u64::from(fps) / 2) / u64::from(fps);
-        let duration = |unit: u64| time(end, unit) - time(start, unit);
-        let pixels = || magnified(&picture.pixels, picture.width, scale).into_flattened();
+        let pixels = magnified(pixels, width, scale).into_flattened();
         match self.encoder.as_mut() {
-            Some(Encoder::Gif(encoder)) => {
-                let (width, height) = (u16::try_from(picture.width)?, u16::try_from(picture.height)?);
-                let mut frame = gif::Frame::from_rgb(width, height, picture.pixels.as_flattened());
-                frame.buffer = magnified(&frame.buffer, picture.width, scale).into();
-                (frame.width, frame.height) =
-                    (u16::try_from(picture.width * scale)?, u16::try_from(picture.height * scale)?);
-                frame.delay = u16::try_from(duration(100))?;
-                encoder.write_frame(&frame)?;
-            }
-            Some(Encoder::Webp(film)) => film.add(&pixels(), u32::try_from(duration(1000))?)?,
-            Some(Encoder::Png(writer)) => {
-                writer.set_frame_delay(count, fps)?;
-                writer.write_image_data(&pixels())?;
+            Some(Encoder::Webp(film)) => {
+                // Rounding errors do not add up: the whole film has the right duration.
+                let milliseconds = |pictures: u64| (pictures * 1000 + u64::from(fps) / 2) / u64::from(fps);
+                film.add(&pixels, u32::try_from(milliseconds(end) - milliseconds(start))?)?;
             }
             Some(Encoder::Mp4(child)) => {
-                let pixels = pixels();
                 let written = child.stdin.as_mut().map(|stdin| (0..count).try_for_each(|_| stdin.write_all(&pixels)));
                 match written {
                     // ffmpeg has ended; `end` reports its error.
@@ -162,9 +114,7 @@ impl FilmFile {
     /// Ends the encoder, which writes the rest of the file.
     fn end(&mut self) -> Result<(), Failure> {
         match self.encoder.take() {
-            Some(Encoder::Gif(encoder)) => encoder.into_inner()?.flush()?,
             Some(Encoder::Webp(film)) => film.finish()?,
-            Some(Encoder::Png(writer)) => writer.finish()?,
             Some(Encoder::Mp4(mut child)) => {
                 drop(child.stdin.take());
                 let mut errors = String::new();
@@ -183,6 +133,10 @@ impl FilmFile {
     }
 
     /// Completes the file and renames it to its final name.
+    ///
+    /// # Errors
+    ///
+    /// If the rest of the file cannot be written, or ffmpeg failed.
     pub fn finish(mut self) -> Result<(), Failure> {
         self.end()
             .and_then(|()| Ok(std::fs::rename(&self.partial, &self.path)?))
@@ -198,19 +152,5 @@ impl Drop for FilmFile {
         }
         // Fails for a finished film, which was renamed.
         let _ = std::fs::remove_file(&self.partial);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn suffixes_name_formats() {
-        for (name, format) in
-            [("a.gif", Format::Gif), ("b.webp", Format::Webp), ("x/b.c.PNG", Format::Png), ("c.Mp4", Format::Mp4)]
-        {
-            assert_eq!(Format::of(Path::new(name)).unwrap(), format);
-        }
     }
 }

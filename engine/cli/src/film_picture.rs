@@ -21,21 +21,14 @@ pub enum View {
 const GAP: usize = 2;
 const GAP_COLOUR: [u8; 3] = [24; 3];
 
-/// RGB pixels in rows.
-pub struct Picture {
-    pub width: usize,
-    pub height: usize,
-    pub pixels: Vec<[u8; 3]>,
-}
-
 impl View {
     /// Width and height of the pictures of a frame.
     pub fn size(self, FrameShape { width, height, .. }: FrameShape) -> (usize, usize) {
         (if self == View::Both { 2 * width + GAP } else { width }, height)
     }
 
-    /// The picture of the film's current step. Call it once per step.
-    pub fn picture(self, film: &mut Film) -> Result<Picture, Failure> {
+    /// The picture of the film's current step, RGB pixels in rows. Call it once per step.
+    pub fn picture(self, film: &mut Film) -> Result<Vec<[u8; 3]>, Failure> {
         let view = film.ground_truth_view()?;
         let agent = film.observation()?;
         // The view is the frame, magnified: reduce it to the frame's size.
@@ -52,8 +45,7 @@ impl View {
                 View::Both => pixels.extend(of_agent().chain([GAP_COLOUR; GAP]).chain(of_view())),
             }
         }
-        let (width, height) = self.size(FrameShape::rgb(width, height));
-        Ok(Picture { width, height, pixels })
+        Ok(pixels)
     }
 }
 

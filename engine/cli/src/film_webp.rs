@@ -56,7 +56,7 @@ impl<W: Write + Seek> WebpFilm<W> {
     pub fn finish(mut self) -> Result<(), Failure> {
         let end = self.file.stream_position()?;
         let length = u32::try_from(end - CHUNK_HEADER as u64)
-            .map_err(|_| "a .webp file has at most 4 GiB; record fewer episodes, or a .png")?;
+            .map_err(|_| "a .webp file has at most 4 GiB; record fewer episodes, or an .mp4")?;
         self.file.seek(SeekFrom::Start(4))?;
         self.file.write_all(&length.to_le_bytes())?;
         Ok(self.file.flush()?)

@@ -6,7 +6,7 @@ mod demo;
 mod engine_process;
 mod failure;
 mod film;
-mod film_file;
+pub mod film_file;
 mod film_picture;
 mod film_webp;
 mod frames;

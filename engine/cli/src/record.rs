@@ -9,7 +9,7 @@ use endless_gym_core::pool::{PoolConfig, PoolError, Registry, ResetOptions, Seed
 
 use super::failure::Failure;
 use super::film::Film;
-use super::film_file::{FilmFile, Format, Shape};
+use super::film_file::{FilmFile, Shape};
 use super::film_picture::View;
 use super::options::parameters;
 use super::output::print;
@@ -33,8 +33,7 @@ struct FilmArgs {
     /// Environment id; `endless list` lists them.
     #[arg(value_name = "ID")]
     id: String,
-    /// File of the film: .gif (256 colours for each picture), .webp or .png (animated, lossless) or .mp4 (needs
-    /// ffmpeg).
+    /// File of the film: .webp (lossless) or .mp4 (needs ffmpeg).
     #[arg(long, value_name = "FILE")]
     film: PathBuf,
     /// Number of episodes, shown in order.
@@ -92,30 +91,14 @@ impl FilmArgs {
             .seeding(Seeding::Continue { seed: Some(self.seed.wrapping_add(episode)) });
         Film::played_by(registry, &config, self.policy, self.action_seed.wrapping_add(episode))
     }
-
-    /// Number of pictures of all episodes.
-    fn count(&self, registry: &Registry) -> Result<u32, Failure> {
-        let mut count: u32 = 0;
-        for episode in 0..self.episodes {
-            let mut film = self.start(registry, episode)?;
-            let mut steps = 0;
-            while steps < self.max_steps && film.step()? {
-                steps += 1;
-            }
-            count = count.checked_add(steps + 1).ok_or("the film has too many pictures; record fewer episodes")?;
-        }
-        Ok(count)
-    }
 }
 
 /// Records the film, and prints the return and the length of each episode.
 fn film(registry: &Registry, args: &FilmArgs) -> Result<(), Failure> {
     let spec = registry.spec(&args.id)?;
-    // A PNG's header holds the number of pictures, so the episodes are played twice.
-    let pictures = if Format::of(&args.film)? == Format::Png { args.count(registry)? } else { 0 };
     let fps = args.fps.unwrap_or(u16::try_from(spec.render_fps)?);
     let size = args.view.size(spec.frame.ok_or(PoolError::NoFrame { id: spec.id })?);
-    let shape = Shape { size, scale: usize::from(args.scale), fps, pictures };
+    let shape = Shape { size, scale: usize::from(args.scale), fps };
     let stop = stop::on_signal()?;
     // Create the environment first, so that invalid options are reported before a file exists.
     let mut next = Some(args.start(registry, 0)?);
