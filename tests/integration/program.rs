@@ -239,6 +239,7 @@ fn errors_of_arguments_are_one_clear_line() {
         (vec!["serve", "--num-envs", "9223372036854775808", "--groups", "4"], "9223372036854775808"),
         (vec!["serve", "--batches-held", "20"], "batches_held must be 1 to 16, got 20"),
         (vec!["serve", "--service", "a/b"], "engine name must be 1 to 64 letters, digits, `.`, `_` or `-`, got `a/b`"),
+        (vec!["watch", "gym"], "`endless status NAME --watch` follows an engine"),
         (vec!["demo", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["demo", "--num-envs", "0"], "num_envs must be 1 to 1048576, got 0"),
         (vec!["demo", "--option", "arena_size=7"], "`arena_size` must be an integer, 2 to 6, got 7"),

@@ -337,8 +337,26 @@ fn status_shows_engines_and_their_processes() {
     let mut watch = Process::spawn(watch.stdout(Stdio::piped()));
     let lines = BufReader::new(watch.0.stdout.take().unwrap()).lines();
     assert!(lines.map_while(Result::ok).filter(|line| line.contains("\"incarnation\"")).nth(2).is_some());
-    watch.signal(Signal::INT);
-    watch.wait();
+    watch.interrupt();
+
+    // A named engine is observed until it ends.
+    let watch = |more: &[&str]| {
+        let arguments = [&["status", "gym", "--watch", "0.05"], more].concat();
+        Process::spawn(place.endless(&arguments).stdout(Stdio::piped()))
+    };
+    let (mut lines, mut tables) = (watch(&["--json"]), watch(&[]));
+    let mut readings = BufReader::new(lines.0.stdout.take().unwrap()).lines();
+    let mut next = || serde_json::from_str::<Json>(&readings.next().unwrap().unwrap()).unwrap()[0].clone();
+    assert_eq!(next()["mean_length"], Json::Null);
+    wait_until("an episode ends", || {
+        (0..20).for_each(|_| drop(step(&mut trainer, 0)));
+        let reading = next();
+        reading["mean_return"].is_number() && reading["mean_length"].as_f64().unwrap() > 1.0
+    });
+    ended(engine, Signal::INT);
+    assert!(lines.wait().success() && tables.wait().success());
+    let tables = tables.output();
+    assert!(tables.contains("\nmean return ") && tables.ends_with("\nthe engine has ended\n"), "{tables}");
 }
 
 /// Sends a request and returns the answer, head and body.

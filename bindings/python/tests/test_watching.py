@@ -1,10 +1,7 @@
-"""Observers that watch a trainer: `endless_gym.watch` and `endless watch`."""
+"""Observers that watch a trainer: `endless_gym.watch`."""
 
 import gc
-import json
 import os
-import pty
-import re
 import signal
 import subprocess
 import sys
@@ -13,10 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from support import rest_of_terminal
 
 import endless_gym
-from endless_gym.program import program
 
 ID = "Endless-MortarMayhem-v0"
 NUM_ENVS = 4
@@ -74,10 +69,6 @@ def trainer(request: pytest.FixtureRequest) -> Iterator[Trainer]:
         started.end()
     gc.collect()
     assert started.process.returncode == 0
-
-
-def watch_command(*arguments: str) -> list[str]:
-    return [*program(), "watch", *arguments]
 
 
 def test_watched_batches_equal_those_of_the_trainer(trainer: Trainer) -> None:
@@ -217,75 +208,3 @@ def test_a_forked_child_does_not_use_the_watch(trainer: Trainer) -> None:
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
         trainer.step()
         assert next(batches).step == 2
-
-
-@pytest.mark.parametrize("trainer", [(2, "alone")], indirect=True)
-def test_the_program_prints_json_lines_until_the_engine_ends(trainer: Trainer) -> None:
-    watching = watch_command(trainer.service, "--json", "--interval", "0.1")
-    process = subprocess.Popen(watching, stdout=subprocess.PIPE, text=True)
-    lines = [json.loads(process.stdout.readline()) for _ in range(10)]
-    assert trainer.end() == "trained\n"
-    rest, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
-    lines += [json.loads(line) for line in rest.splitlines()]
-    assert [line["ended"] for line in lines] == [False] * (len(lines) - 1) + [True]
-    last = lines[-1]
-    assert (last["service"], last["environment"]) == (trainer.service, ID)
-    assert 0 <= last["missed"] < last["batches"]
-    assert max(line["steps_per_second"] for line in lines) > 0
-    assert last["episodes"] > 0
-    assert last["mean_length"] > 1
-
-
-@pytest.mark.parametrize("trainer", [(1, "alone")], indirect=True)
-def test_the_program_prints_lines_until_ctrl_c(trainer: Trainer) -> None:
-    process = subprocess.Popen(
-        watch_command(trainer.service, "--interval", "0.1"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    line = process.stdout.readline()
-    assert re.fullmatch(
-        rf"{trainer.service} {ID}: [\d,]+ steps/s, [\d,]+ episodes.*, [\d,]+ of [\d,]+ batches missed\n", line
-    )
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors) == (0, "")
-    assert "ended" not in output
-    assert trainer.end() == "trained\n"
-
-
-@pytest.mark.parametrize("trainer", [(1, "alone")], indirect=True)
-def test_the_program_updates_one_line_of_a_terminal(trainer: Trainer) -> None:
-    leader, follower = pty.openpty()
-    process = subprocess.Popen(watch_command(trainer.service), stdout=follower, stderr=follower)
-    os.close(follower)
-    text = b""
-    while text.count(b"steps/s") < 3:
-        text += os.read(leader, 4096)
-    assert trainer.end() == "trained\n"
-    text += rest_of_terminal(leader)
-    assert process.wait(60) == 0
-    live, *others = text.decode().replace("\r\n", "\n").split("\n")
-    assert live.count("\r\x1b[2K") >= 3
-    assert others == ["the engine has ended", ""]
-
-
-def test_the_program_names_the_running_engines_if_there_is_none(trainer: Trainer) -> None:
-    ran = subprocess.run(watch_command("absent", "--timeout", "0.1"), capture_output=True, text=True, timeout=60)
-    assert ran.returncode == 1
-    assert len(ran.stderr.splitlines()) == 1
-    assert "absent" in ran.stderr
-    assert trainer.service in ran.stderr
-
-
-def test_without_a_name_the_program_watches_the_only_engine(trainer: Trainer) -> None:
-    trainer.step()
-    watching = watch_command("--json", "--interval", "0.1")
-    with subprocess.Popen(watching, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert json.loads(process.stdout.readline())["service"] == trainer.service
-        process.send_signal(signal.SIGINT)
-    with endless_gym.serve(ID) as envs:
-        ran = subprocess.run(watch_command(), capture_output=True, text=True, timeout=60)
-        assert ran.returncode == 1
-        names = ", ".join(sorted((trainer.service, envs._engine.service)))
-        assert ran.stderr == f"endless: several engines run: {names}; give the name of one\n"

@@ -30,7 +30,6 @@ mod stop;
 mod terminal;
 mod verify;
 mod view;
-mod watch;
 
 use std::ffi::OsString;
 
@@ -65,11 +64,8 @@ enum Command {
     Demo(demo::Args),
     /// Serve environments in shared memory until Ctrl-C.
     Serve(serve::Args),
-    /// Show what the running engines are doing, without disturbing them.
+    /// Show what the running engines are doing, without disturbing them, or follow one.
     Status(status::Args),
-    /// Watch a training run, which does not wait for it: steps per second, episodes, returns and lengths, until Ctrl-C or the
-    /// engine's end.
-    Watch(watch::Args),
     /// Show the environments of a running engine in a browser on this machine or in the terminal.
     View(view::Args),
     /// Play an environment in a browser on this machine or in the terminal.
@@ -116,7 +112,7 @@ const FAILURE: u8 = 1;
 ///
 /// If the process has no `tracing` subscriber yet, the first call installs one that logs to standard error.
 ///
-/// `demo`, `serve`, `watch`, `play`, `view`, `record` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP,
+/// `demo`, `serve`, `status`, `play`, `view`, `record` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP,
 /// which stay installed. The first signal stops the command, and a second one ends the process at once. Do not run two
 /// of these commands at the same time in one process: they share one stop flag, which a signal sets and a starting
 /// command clears.
@@ -126,6 +122,9 @@ pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, 
     let _ = SigSet::from(Signal::SIGXFSZ).thread_block();
     let mut arguments: Vec<_> = std::iter::once("endless".into()).chain(arguments).collect();
     let parse = |arguments: &[OsString]| {
+        if arguments.get(1).is_some_and(|name| name == "watch") {
+            return Err("there is no command `watch`; `endless status NAME --watch` follows an engine".into());
+        }
         let is_learning = arguments.get(1).is_some_and(|name| name == "learn");
         let (mut command, mut arguments) = (command(registry), arguments.to_vec());
         if is_learning {
@@ -188,7 +187,6 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::Demo(args) => demo::run(registry, &args)?,
         Command::Serve(args) => serve::run(registry, &args)?,
         Command::Status(args) => status::run(&args)?,
-        Command::Watch(args) => watch::run(&args)?,
         Command::View(args) => view::run(&args)?,
         Command::Play(args) => play_command::run(registry, &args)?,
         Command::Record(args) => record::run(registry, &args)?,

@@ -72,18 +72,6 @@ pub fn clear() -> Result<(), Failure> {
     if stdout.is_terminal() { check(write!(stdout, "\x1b[H\x1b[2J")) } else { Ok(()) }
 }
 
-/// Replaces the last line of the terminal on standard output with `text`, cut to the terminal's width.
-pub fn replace_line(text: &str) -> Result<(), Failure> {
-    let fitting: String = printable(text).chars().take(usize::from(width()).saturating_sub(1)).collect();
-    let mut stdout = io::stdout().lock();
-    check(write!(stdout, "\r\x1b[2K{fitting}").and_then(|()| stdout.flush()))
-}
-
-/// Ends the line that `replace_line` wrote, if there is one.
-pub fn end_line(is_live: bool) -> Result<(), Failure> {
-    if is_live { print("") } else { Ok(()) }
-}
-
 /// Prints one JSON document to standard output, with all characters but those of ASCII escaped.
 pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     print(ascii(&serde_json::to_string_pretty(value)?))

@@ -1,29 +1,37 @@
 //! `endless status`.
 
 use std::collections::BTreeSet;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{EngineProcesses, EngineStatus, GroupStatus, Namespace};
+use endless_gym_service::{
+    ConnectConfig, EngineProcesses, EngineStatus, GroupStatus, Namespace, Observers, ServiceError,
+};
+use endless_gym_view::RecentEpisodes;
 use serde_json::{Value as Json, json};
 
 use super::failure::Failure;
 use super::options::seconds;
-use super::output::{clear, fit, grouped, print, print_json, table};
+use super::output::{clear, fit, grouped, print, print_json, print_json_line, table};
 use super::stop;
 
 /// Time between the two readings from which steps per second are computed, unless `--watch` sets it.
 const INTERVAL: Duration = Duration::from_millis(250);
+
+/// Longest wait for a batch between checks of the stop flag.
+const SLICE: Duration = Duration::from_millis(50);
 
 /// Arguments of `endless status`.
 #[derive(clap::Args)]
 pub struct Args {
     /// Name of the engine [default: all running engines].
     service: Option<String>,
-    /// Print JSON [default: text]. With `--watch`, one document for each reading.
+    /// Print JSON [default: text]. With `--watch`, a line for each reading.
     #[arg(long)]
     json: bool,
-    /// Repeat every SECONDS, until Ctrl-C.
+    /// Repeat every SECONDS, until Ctrl-C or the end of the named engine, whose episodes are then observed: their mean return and
+    /// length are those of the last 1,000.
     #[arg(long, value_name = "SECONDS", num_args = 0..=1, default_missing_value = "1")]
     watch: Option<f64>,
 }
@@ -39,24 +47,50 @@ struct Reading {
 /// Runs `endless status`.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let namespace = Namespace::default();
+    let mut before = (Instant::now(), read(args, &namespace)?);
     let Some(given) = args.watch else {
-        let before = (Instant::now(), read(args, &namespace)?);
         thread::sleep(INTERVAL);
-        return show(args, &readings(args, &namespace, &before)?);
+        return show(args, &readings(args, &namespace, &before)?, None);
     };
     let (interval, stop) = (seconds("--watch", given)?, stop::on_signal()?);
-    let mut before = (Instant::now(), read(args, &namespace)?);
+    let connect = |service: &String| Observers::connect(&ConnectConfig::new(service), None);
+    let mut observers = args.service.as_ref().map(connect).transpose()?;
+    let mut episodes = RecentEpisodes::default();
     loop {
-        if stop::wait(stop, interval) {
+        if is_stopped(stop, interval, observers.as_mut(), &mut episodes)? {
             return Ok(());
         }
-        let readings = readings(args, &namespace, &before)?;
+        let Ok(readings) = readings(args, &namespace, &before) else {
+            return if args.json { Ok(()) } else { print("the engine has ended") };
+        };
         if !args.json {
             clear()?;
         }
-        show(args, &readings)?;
+        show(args, &readings, episodes.means())?;
         before = (Instant::now(), readings.into_iter().map(|reading| reading.status).collect());
     }
+}
+
+/// Waits and adds the episodes that end. Returns whether a signal came.
+fn is_stopped(
+    stop: &AtomicBool,
+    interval: Duration,
+    observers: Option<&mut Observers>,
+    episodes: &mut RecentEpisodes,
+) -> Result<bool, Failure> {
+    let end = Instant::now() + interval;
+    let left = || end.saturating_duration_since(Instant::now());
+    if let Some(observers) = observers {
+        while !stop.load(Ordering::Relaxed) && !left().is_zero() {
+            match observers.next(SLICE.min(left())) {
+                Ok(observed) => episodes.add(&observed.lease.batch()),
+                Err(ServiceError::TimedOut { .. }) => {}
+                Err(ServiceError::EngineLost { .. }) => break,
+                Err(error) => return Err(error.into()),
+            }
+        }
+    }
+    Ok(stop::wait(stop, left()))
 }
 
 /// The status of the requested engines.
@@ -99,14 +133,27 @@ fn env_steps(status: &EngineStatus) -> u64 {
     status.total(|group| group.env_steps)
 }
 
-fn show(args: &Args, readings: &[Reading]) -> Result<(), Failure> {
+/// Prints the readings, and the mean return and length of the episodes of the named engine.
+fn show(args: &Args, readings: &[Reading], means: Option<(f64, f64)>) -> Result<(), Failure> {
     match readings {
         _ if args.json => {
-            let all = readings.iter().map(as_json).collect::<Result<Vec<_>, _>>()?;
-            print_json(&all)
+            let mut all = readings.iter().map(as_json).collect::<Result<Vec<_>, _>>()?;
+            if args.watch.is_none() {
+                return print_json(&all);
+            }
+            if args.service.is_some() {
+                all[0]["mean_return"] = json!(means.map(|(mean, _)| mean));
+                all[0]["mean_length"] = json!(means.map(|(_, mean)| mean));
+            }
+            print_json_line(&all)
         }
         [] => print("no engine is running"),
-        [one] if args.service.is_some() => print(format_args!("{}\n\n{}", engines(readings), groups(&one.status))),
+        [one] if args.service.is_some() => {
+            let means = means.map_or_else(String::new, |(mean_return, mean_length)| {
+                format!("\nmean return {mean_return:.3}, mean length {mean_length:.1}")
+            });
+            print(format_args!("{}\n\n{}{means}", engines(readings), groups(&one.status)))
+        }
         _ => print(engines(readings)),
     }
 }

@@ -10,7 +10,7 @@ use endless_gym_view::ViewServer;
 use super::failure::Failure;
 use super::open::PrivatePage;
 use super::output::{print, print_error};
-use super::{stop, terminal, watch};
+use super::{stop, terminal};
 
 /// Arguments of `endless view`.
 ///
@@ -45,7 +45,7 @@ pub struct PageArgs {
 /// Runs `endless view`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
     if args.terminal.terminal {
-        return terminal::view::run(&watch::named_or_only(args.service.as_deref())?, &args.terminal);
+        return terminal::view::run(args.service.as_deref(), &args.terminal);
     }
     let stop = stop::on_signal()?;
     if let Some(parent) = args.child {

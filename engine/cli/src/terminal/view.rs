@@ -1,13 +1,15 @@
 //! `endless view --terminal`.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::Frames;
 use endless_gym_core::raster::FrameShape;
-use endless_gym_service::{Observed, Pictures, ServiceError};
-use endless_gym_view::RecentRate;
+use endless_gym_service::{
+    ConnectConfig, ErrorKind, Namespace, Observed, Observers, Pictures, ServiceError, running_engines,
+};
+use endless_gym_view::{RecentEpisodes, RecentRate};
 use ratatui::Frame;
 use ratatui::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers};
 use ratatui::layout::Rect;
@@ -16,7 +18,6 @@ use super::super::failure::Failure;
 use super::super::options::seconds;
 use super::super::output::{grouped, print};
 use super::super::stop;
-use super::super::watch::{Statistics, connect};
 use super::frame::newest;
 use super::picture::{Pixels, fitting};
 use super::screen::{Screen, check};
@@ -140,11 +141,12 @@ impl Grid {
 }
 
 /// Shows an engine until a key or a signal ends it, or the terminal goes away.
-pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
+pub fn run(service: Option<&str>, args: &TerminalArgs) -> Result<(), Failure> {
+    let service = named_or_only(service)?;
     check()?;
     let timeout = seconds("--timeout", args.timeout)?;
     let stop = stop::on_signal()?;
-    let Some(mut observers) = connect(service, args.group, timeout, stop)? else { return Ok(()) };
+    let Some(mut observers) = connect(&service, args.group, timeout, stop)? else { return Ok(()) };
     let specification = observers.specification().clone();
     let groups = args.group.map_or(0..specification.groups, |group| group..group + 1);
     let mut pictures = BTreeMap::new();
@@ -160,7 +162,7 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
         seen: BTreeMap::new(),
         places: specification.num_envs,
     };
-    let mut statistics = Statistics::new(specification.num_envs);
+    let (mut steps, mut episodes) = (0, RecentEpisodes::default());
     let title = format!("{service} {}", specification.id);
     let mut screen = Screen::enter()?;
     let (mut has_ended, mut drawn, mut rate, mut rated) = (false, None::<Instant>, 0.0, Instant::now());
@@ -170,7 +172,9 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
         if !has_ended {
             match observers.next(SLICE) {
                 Ok(observed) => {
-                    statistics.add(&observed);
+                    let played = observed.missed.saturating_add(1).saturating_mul(specification.num_envs as u64);
+                    steps = played.saturating_add(steps);
+                    episodes.add(&observed.lease.batch());
                     wall.add(&observed);
                 }
                 Err(ServiceError::TimedOut { .. }) => {}
@@ -180,17 +184,53 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
         }
         if rated.elapsed() >= RATE_INTERVAL {
             rated = Instant::now();
-            rate = recent.add(rated, statistics.steps()).unwrap_or(0.0);
+            rate = recent.add(rated, steps).unwrap_or(0.0);
         }
         if drawn.is_none_or(|time| time.elapsed() >= INTERVAL) {
             drawn = Some(Instant::now());
             wall.refresh()?;
-            let lines = lines(&title, &statistics, if has_ended { 0.0 } else { rate }, has_ended);
+            let lines = lines(&title, &episodes, if has_ended { 0.0 } else { rate }, has_ended);
             screen.draw(|frame| draw(frame, &mut wall, lines))?;
         }
     }
     drop(screen);
     if has_ended { print("the engine has ended") } else { Ok(()) }
+}
+
+/// The name of an engine, by default of the only one that runs. `endless` is meant if it runs among others, or may start.
+fn named_or_only(service: Option<&str>) -> Result<String, Failure> {
+    const DEFAULT: &str = "endless";
+    if let Some(service) = service {
+        return Ok(service.to_owned());
+    }
+    let mut running = running_engines(&Namespace::default())?;
+    match running.len() {
+        1 => Ok(running.remove(0)),
+        0 => Ok(DEFAULT.to_owned()),
+        _ if running.iter().any(|name| name == DEFAULT) => Ok(DEFAULT.to_owned()),
+        _ => Err(format!("several engines run: {}; give the name of one", running.join(", ")).into()),
+    }
+}
+
+/// The observers, or `None` if a signal came while waiting for the engine.
+fn connect(
+    service: &str,
+    group: Option<usize>,
+    timeout: Duration,
+    stop: &AtomicBool,
+) -> Result<Option<Observers>, Failure> {
+    let start = Instant::now();
+    loop {
+        let left = timeout.saturating_sub(start.elapsed());
+        let config = ConnectConfig::new(service).timeout(left.min(SLICE));
+        match Observers::connect(&config, group) {
+            Err(error) if left > SLICE && matches!(error.kind(), ErrorKind::Unavailable | ErrorKind::Lost) => {}
+            connected => return Ok(Some(connected?)),
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
+    }
 }
 
 /// Checks for keys that quit, and whether the terminal has gone away. Waits for them if there is nothing else to wait for.
@@ -209,10 +249,9 @@ fn is_quit(screen: &Screen, is_waiting: bool) -> Result<bool, Failure> {
     Ok(screen.is_gone())
 }
 
-fn lines(title: &str, statistics: &Statistics, rate: f64, has_ended: bool) -> [String; 2] {
-    let mut first =
-        format!("{title}: {} steps/s, {} episodes", grouped(rate), grouped(statistics.episodes.ended as f64));
-    if let Some((mean_return, mean_length)) = statistics.episodes.means() {
+fn lines(title: &str, episodes: &RecentEpisodes, rate: f64, has_ended: bool) -> [String; 2] {
+    let mut first = format!("{title}: {} steps/s, {} episodes", grouped(rate), grouped(episodes.ended as f64));
+    if let Some((mean_return, mean_length)) = episodes.means() {
         first += &format!(", mean return {mean_return:.3}, mean length {mean_length:.1}");
     }
     let second = if has_ended { "the engine has ended; Q, Esc or Ctrl-C quits" } else { "Q, Esc or Ctrl-C quits" };
