@@ -3,7 +3,7 @@
 #
 #     docker build --tag endless-gym .
 #     docker run --rm --shm-size=2g endless-gym demo --env Endless-MortarMayhem-v0
-#     docker run --rm --shm-size=2g --entrypoint python endless-gym -m endless_gym
+#     docker run --rm --shm-size=2g endless-gym bench --env all
 #
 # Batches are in /dev/shm, of which a container has 64 MB by default: --shm-size raises it. Run an engine and its trainers in one
 # container, for example with `endless_gym.serve` or `docker exec`; `compose.yaml` runs them in two that share /dev/shm.

@@ -5,9 +5,8 @@ cargo xtask bench --markdown t.md --json t.json
 
 Requires Python 3.11 with this package and `stable-baselines3`, and another Python 3.11 (`--original`) with
 `memory-gym`. The original pins Gymnasium 0.29 and numpy 1. Its environments run in a process of this Python whose
-PYTHONPATH lists the packages of the other Python first; Stable-Baselines3 comes from this Python. For scale, EnvPool's
-environments and the memory bandwidth are measured as well; PufferLib's environments are not, since their build
-downloads sources. Each round measures every contender once, so that the load of other programs affects all of them.
+PYTHONPATH lists the packages of the other Python first; Stable-Baselines3 comes from this Python. Each round measures
+every contender once, so that the load of other programs affects all of them.
 """
 
 from __future__ import annotations
@@ -28,15 +27,11 @@ import numpy as np
 
 import endless_gym
 from endless_gym import _native
-from endless_gym.__main__ import measure
 from endless_gym.program import program
 
 IDS = ["Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"]
 VECTORS = ["SyncVectorEnv", "AsyncVectorEnv", "SubprocVecEnv"]
 SIZES = [64, 1024]
-
-#: EnvPool's environment with the most similar observations (four gray frames of 84 x 84), and its fastest environment.
-ENVPOOL = ["Pong-v5", "CartPole-v1"]
 
 #: Targets: multiple of the best vectorised original, multiple of the original's single environment, and share of the
 #: speed of the service from Rust.
@@ -79,9 +74,18 @@ class Original:
 
 
 def vector(make: Any, id: str, num_envs: int, threads: int, seconds: float) -> float:
-    """Steps per second of `make_vec` or `serve`."""
+    """Steps per second of `make_vec` or `serve`, after a short warm-up."""
     with make(id, num_envs, num_threads=threads or None) as envs:
-        return measure(envs, seconds)
+        envs.reset(seed=0)
+        envs.action_space.seed(0)
+        actions = [np.asarray(envs.action_space.sample()) for _ in range(64)]
+        for action in actions[:20]:
+            envs.step(action)
+        steps, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            envs.step(actions[steps % len(actions)])
+            steps += 1
+        return steps * num_envs / (time.perf_counter() - start)
 
 
 def single(id: str, seconds: float) -> float:
@@ -106,38 +110,6 @@ def rust(id: str, num_envs: int, threads: int, seconds: float) -> dict[str, floa
     return {
         f"Rust, {entry['method']}, {num_envs} environments": entry["steps_per_second"] for entry in row["measurements"]
     }
-
-
-def envpool(python: str, id: str, num_envs: int, seconds: float) -> float:
-    """Steps per second of an EnvPool environment."""
-    script = str(Path(__file__).with_name("comparison_envpool.py"))
-    command = [python, "-W", "ignore", script, id, str(num_envs), str(seconds)]
-    return float(subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True).split()[-1])
-
-
-def memory_bandwidth() -> float:
-    """Write bandwidth of a large memory copy in GB/s; it reads the same amount."""
-    source = np.ones(1 << 28, dtype=np.uint8)
-    target = np.zeros_like(source)
-    start = time.perf_counter()
-    np.copyto(target, source)
-    return source.nbytes / (time.perf_counter() - start) / 1e9
-
-
-def scale(args: argparse.Namespace) -> dict[str, float]:
-    """Medians of the EnvPool environments and of the memory bandwidth, for scale."""
-    contenders: dict[str, Any] = {"memory copy, GB/s written": (memory_bandwidth,)}
-    if args.envpool:
-        for id in ENVPOOL:
-            name = f"EnvPool's {id}, {SIZES[0]} environments, steps/s"
-            contenders[name] = (envpool, args.envpool, id, SIZES[0], args.seconds)
-    results: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(args.rounds):
-        for name, (contender, *arguments) in contenders.items():
-            progress(name)
-            results[name].append(contender(*arguments))
-    progress("")
-    return {name: round(statistics.median(values), 1) for name, values in results.items()}
 
 
 def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, Any]:
@@ -196,9 +168,7 @@ def markdown(whole: dict[str, Any]) -> str:
     """The results as Markdown."""
     lines = ["# Steps per second compared with the original", ""]
     lines += [f"- {name.replace('_', ' ')}: {value}" for name, value in whole["machine"].items()]
-    lines += [f"- medians of {whole['rounds']} rounds of {whole['seconds']} s", ""]
-    lines += ["| for scale | |", "| --- | ---: |"]
-    lines += [f"| {name} | {value:,} |" for name, value in whole["scale"].items()]
+    lines += [f"- medians of {whole['rounds']} rounds of {whole['seconds']} s"]
     for row in whole["environments"]:
         reference = row["medians"][row["best_original"]]
         lines += ["", f"## {row['id']}", "", "| | steps/s | lowest | highest | x best vectorised original |"]
@@ -241,13 +211,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="measurements of each contender (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=1.0, help="seconds of each measurement (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="engine threads; 0 for one per core (default: 0)")
-    parser.add_argument(
-        "--envpool", metavar="PYTHON", help="Python interpreter with envpool; EnvPool is measured only if given"
-    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all results to this file")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables to this file, as Markdown")
     args = parser.parse_args()
-    whole = {"machine": machine(), "rounds": args.rounds, "seconds": args.seconds, "scale": scale(args)}
+    whole = {"machine": machine(), "rounds": args.rounds, "seconds": args.seconds}
     original = Original(args.original)
     whole["environments"] = [compare(id, original, args) for id in args.ids]
     print(markdown(whole))

@@ -4,10 +4,7 @@
 //! two. The variants have separate environments and take turns of a few milliseconds of CPU time. The results are
 //! medians.
 //!
-//! Arguments: ids (default: all); `--on-request` steps for `benches/compare_builds.py`. `cargo xtask instructions` counts the
-//! instructions of a step.
-
-mod actions;
+//! Arguments: ids (default: all). `cargo xtask instructions` counts the instructions of a step.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -22,10 +19,10 @@ use endless_gym_memory_gym::mystery_path::{self, MysteryPath};
 use endless_gym_memory_gym::searing_spotlights::{self, SearingSpotlights};
 use endless_gym_memory_gym::{FRAME, SCREEN, memory_gym};
 use memmap2::{Advice, MmapMut};
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::Map;
-
-use actions::Actions;
 
 const SIZES: [usize; 3] = [64, 1024, 16384];
 const ROUNDS: usize = 9;
@@ -42,6 +39,31 @@ const SCENE: u8 = 1;
 const COMPARED: u8 = 2;
 /// Also paints the differences.
 const PAINTED: u8 = 3;
+
+/// Steps after which the actions repeat, in other states.
+const ACTION_STEPS: usize = 251;
+
+/// Random actions of all environments, step after step, drawn before the clock starts, since drawing them takes about as long as a
+/// step.
+struct Actions {
+    steps: Vec<Vec<i32>>,
+    step: usize,
+}
+
+impl Actions {
+    fn new(spec: &EnvSpec, num_envs: usize) -> Self {
+        let branches = spec.action_space.branches();
+        let mut random = SmallRng::seed_from_u64(1);
+        let mut draw = |choices: &i32| random.random_range(0..*choices);
+        let mut step = || (0..num_envs).flat_map(|_| branches).map(&mut draw).collect();
+        Actions { steps: (0..ACTION_STEPS).map(|_| step()).collect(), step: 0 }
+    }
+
+    fn next(&mut self) -> &[i32] {
+        self.step = (self.step + 1) % ACTION_STEPS;
+        &self.steps[self.step]
+    }
+}
 
 /// One environment, with what a pool keeps for it.
 struct Player<E: Environment> {
@@ -115,11 +137,6 @@ impl<E: Environment> Players<E> {
 /// A step of all environments.
 type Step = Box<dyn FnMut()>;
 
-fn pool(spec: &'static EnvSpec, num_envs: usize) -> Pool {
-    let config = PoolConfig::new(spec.id, num_envs).seeding(Seeding::Continue { seed: Some(1) });
-    Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap()
-}
-
 /// Memory that a step writes to, in small or in huge pages.
 fn memory(bytes: usize, huge: bool) -> MmapMut {
     let memory = MmapMut::map_anon(bytes).unwrap();
@@ -132,7 +149,8 @@ fn memory(bytes: usize, huge: bool) -> MmapMut {
 }
 
 fn pool_step(spec: &'static EnvSpec, num_envs: usize, huge: bool) -> Step {
-    let mut pool = pool(spec, num_envs);
+    let config = PoolConfig::new(spec.id, num_envs).seeding(Seeding::Continue { seed: Some(1) });
+    let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
     let mut batch = memory(pool.layout().blocks() * size_of::<Block>(), huge);
     let mut actions = Actions::new(spec, num_envs);
     pool.reset(ResetRequest::All, bytemuck::cast_slice_mut(&mut batch)).unwrap();
@@ -206,22 +224,6 @@ fn times<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant) 
     }
 }
 
-/// Reads a number of steps from each line of standard input, takes them, and prints the CPU time of an environment's
-/// step in nanoseconds.
-fn on_request(spec: &'static EnvSpec, num_envs: usize) {
-    let mut step = pool_step(spec, num_envs, false);
-    for line in std::io::stdin().lines() {
-        let steps: usize = line.unwrap().parse().unwrap();
-        // Warm the caches with this variant's memory.
-        step();
-        let start = processor_time();
-        for _ in 0..steps {
-            step();
-        }
-        println!("{}", (processor_time() - start) / (steps * num_envs) as f64);
-    }
-}
-
 /// Prints the rows of a family's ids: of those in `wanted`, or of all if it is empty.
 fn all_times<E: Environment + 'static>(ids: &'static [(EnvSpec, E::Variant)], wanted: &[&str]) {
     for (spec, variant) in ids.iter().filter(|(spec, _)| wanted.is_empty() || wanted.contains(&spec.id)) {
@@ -233,9 +235,6 @@ fn main() {
     // Cargo adds `--bench`.
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    if let ["--on-request", id, num_envs] = arguments[..] {
-        return on_request(memory_gym().spec(id).unwrap(), num_envs.parse().unwrap());
-    }
     println!("| id | environments | rules | scene | compare | paint | own frames | pool | all | huge pages |");
     println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
     all_times::<MortarMayhem>(mortar_mayhem::IDS, &arguments);

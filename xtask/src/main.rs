@@ -58,7 +58,7 @@ enum Task {
         #[arg(long)]
         record: bool,
     },
-    /// Compare steps per second with the original and with other libraries.
+    /// Compare steps per second with the original.
     #[command(disable_help_flag = true)]
     Bench {
         /// Arguments of benches/comparison.py; `--help` lists them.

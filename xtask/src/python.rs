@@ -234,12 +234,8 @@ pub fn bench(arguments: &[String]) -> Result<(), String> {
     let environment = environment()?;
     install(&environment)?;
     let mut script = Command::new(environment.join("bin/python"));
-    script.arg(workspace().join("benches/comparison.py")).arg("--original").arg(original()?).args(arguments);
-    match tools("envpool", &base()?, &["envpool==1.2.5"]) {
-        Ok(folder) => drop(script.arg("--envpool").arg(folder.join("bin/python"))),
-        Err(message) => eprintln!("without EnvPool: {message}"),
-    }
-    run(&mut script)
+    script.arg(workspace().join("benches/comparison.py")).arg("--original").arg(original()?);
+    run(script.args(arguments))
 }
 
 /// Makes all pictures of the documentation.
