@@ -87,7 +87,7 @@ enum Task {
     },
     /// Run the fuzz targets as property tests, with new seeds.
     Fuzz {
-        /// A target: actions, checkpoints, layouts, options, snapshots or traces [default: all].
+        /// A target: actions, checkpoints, options, snapshots or traces [default: all].
         target: Option<String>,
         /// Duration in minutes; every target runs at least once.
         #[arg(long, default_value_t = 1)]

@@ -87,24 +87,3 @@ pub fn remove_all(namespace: &Namespace) {
     }
     let _ = fs::remove_dir_all(namespace.root());
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn files_and_segments_are_found() {
-        let namespace = Namespace::at(format!("/tmp/endless-clean-{}", std::process::id()));
-        fs::create_dir_all(namespace.root().join("a")).unwrap();
-        let segment = PathBuf::from(format!("/dev/shm/{}x", namespace.prefix()));
-        let inner = namespace.root().join("a/b");
-        for path in [&segment, &inner] {
-            fs::write(path, "").unwrap();
-        }
-        assert_eq!(files(&namespace), [inner.clone(), segment]);
-        set_age(&namespace, -60);
-        assert!(fs::metadata(&inner).unwrap().modified().unwrap().elapsed().unwrap() >= Duration::from_secs(59));
-        remove_all(&namespace);
-        assert_eq!(files(&namespace), [] as [PathBuf; 0]);
-    }
-}

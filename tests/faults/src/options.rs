@@ -40,23 +40,3 @@ fn value(draws: &mut Generator, kind: ParameterKind) -> Json {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use endless_gym_core::pool::{Pool, Threads};
-
-    use crate::shape::Shape;
-
-    use super::*;
-
-    #[test]
-    fn random_shapes_are_valid() {
-        for seed in 0..60 {
-            let shape = Shape::random(&mut Generator::from_seed(seed), 6);
-            for group in 0..shape.groups {
-                Pool::new(environments(), &shape.pool(group), &Threads::new(1).unwrap())
-                    .unwrap_or_else(|e| panic!("{shape:?}: {e}"));
-            }
-        }
-    }
-}

@@ -8,7 +8,8 @@ use crate::playing;
 
 const STEPS: usize = 100;
 
-pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
+/// The target.
+pub fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let spec = playing::spec(input)?;
     let autoreset = *input.choose(&[Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled])?;
     let mut pool = playing::pool(spec, OptionMap::new(), autoreset).expect("defaults are valid");

@@ -9,7 +9,8 @@ use crate::playing;
 
 const ENVS: usize = 2;
 
-pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
+/// The target.
+pub fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let spec = playing::spec(input)?;
     let frames = Some(Frames { stack: input.int_in_range(1..=4)?, ..Frames::default() });
     let seeding = Seeding::Continue { seed: Some(3) };

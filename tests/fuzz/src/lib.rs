@@ -4,13 +4,12 @@
 //! fails if it panics or takes longer than [`BUDGET`]. `tests/properties.rs` calls the targets with generated and
 //! recorded inputs; the package in `cargo-fuzz` runs them with libFuzzer.
 
-mod actions;
-mod checkpoints;
-mod layouts;
-mod options;
+pub mod actions;
+pub mod checkpoints;
+pub mod options;
 mod playing;
 pub mod snapshots;
-mod traces;
+pub mod traces;
 mod watchdog;
 
 use arbitrary::Unstructured;
@@ -20,23 +19,12 @@ pub use watchdog::BUDGET;
 /// A function of arbitrary bytes. An error means that it ended early because the input was too short.
 pub type Target = fn(&mut Unstructured<'_>) -> arbitrary::Result<()>;
 
-/// The targets by name.
-pub const TARGETS: [(&str, Target); 6] = [
-    ("actions", actions::target),
-    ("checkpoints", checkpoints::target),
-    ("layouts", layouts::target),
-    ("options", options::target),
-    ("snapshots", snapshots::target),
-    ("traces", traces::target),
-];
-
-/// Calls the target of that name. The process is aborted if it takes longer than [`BUDGET`].
+/// Calls a target. The process is aborted if it takes longer than [`BUDGET`].
 ///
 /// # Panics
 ///
-/// If there is no such target, or if the target finds a fault.
-pub fn run(name: &str, data: &[u8]) {
-    let (_, target) = TARGETS.into_iter().find(|(known, _)| *known == name).expect("the name of a target");
+/// If the target finds a fault.
+pub fn run(target: Target, data: &[u8]) {
     let _ = watchdog::within_budget(data.to_vec(), || target(&mut Unstructured::new(data)));
 }
 

@@ -9,7 +9,8 @@ use crate::playing;
 
 const STEPS: usize = 60;
 
-pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
+/// The target.
+pub fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let spec = playing::spec(input)?;
     let autoreset = *input.choose(&[Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled])?;
     let later: bool = input.arbitrary()?;

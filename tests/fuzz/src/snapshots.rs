@@ -297,7 +297,8 @@ pub fn extremes() -> Vec<Value> {
 }
 
 /// Plays a snapshot in which some numbers, or some bytes, are replaced.
-pub(crate) fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
+/// The target.
+pub fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
     let spec = playing::spec(input)?;
     let seeding = match input.int_in_range(0..=2)? {
         0 => Seeding::Continue { seed: Some(3) },

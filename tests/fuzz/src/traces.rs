@@ -4,7 +4,8 @@ use arbitrary::{Result, Unstructured};
 use endless_gym_core::trace::{Trace, replay};
 use endless_gym_memory_gym::memory_gym;
 
-pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
+/// The target.
+pub fn target(input: &mut Unstructured<'_>) -> Result<()> {
     if let Ok(trace) = serde_json::from_slice::<Trace>(input.bytes(input.len())?) {
         // Any result is fine, except a panic.
         let _ = replay(memory_gym(), &trace);

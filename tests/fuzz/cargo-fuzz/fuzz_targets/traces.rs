@@ -1,3 +1,3 @@
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|data: &[u8]| endless_gym_fuzz::run("traces", data));
+libfuzzer_sys::fuzz_target!(|data: &[u8]| endless_gym_fuzz::run(endless_gym_fuzz::traces::target, data));
