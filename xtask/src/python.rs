@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::OnceLock;
 
 use crate::shell::{describe, files_below, output, recreate, run, target, workspace};
 
@@ -120,40 +120,37 @@ fn install_with_agents(environment: &Path) -> Result<(), String> {
 
 /// The path of the Python that has the original.
 pub fn original() -> Result<PathBuf, String> {
-    let base = interpreter(ORIGINAL)
-        .ok_or("CPython 3.11 is missing, the newest for which the original's pygame has wheels")?;
     // Pinned, so that every comparison uses the same original.
-    Ok(tools("original", &base, &["memory-gym==1.0.2", "numpy==1.26.4"])?.join("bin/python"))
+    reference("original", &["memory-gym==1.0.2", "numpy==1.26.4"])
 }
 
 /// The path of the Python that has POPGym.
 pub fn popgym() -> Result<PathBuf, String> {
-    let base =
-        interpreter(ORIGINAL).ok_or("CPython 3.11 is missing, which numpy's version of the recordings supports")?;
-    let packages = ["popgym==1.0.7", "gymnasium==1.4.0", "mazelib==0.9.16", "cython==3.3.1", "numpy==2.4.6"];
-    Ok(tools("popgym", &base, &packages)?.join("bin/python"))
+    reference("popgym", &["popgym==1.0.7", "gymnasium==1.4.0", "mazelib==0.9.16", "cython==3.3.1", "numpy==2.4.6"])
 }
 
-/// Builds the wheel with a cargo profile; the Rust tests use `dev`.
-pub fn wheel(profile: &str) -> Result<(), String> {
-    let bin = environment()?.join("bin");
-    let wheels = target()?.join("wheels");
-    recreate(&wheels)?;
-    let mut maturin = Command::new(bin.join("maturin"));
-    maturin.args(["build", "--locked", "--manifest-path", "bindings/python/Cargo.toml", "--profile", profile]);
-    run(maturin.arg("--interpreter").arg(bin.join("python")).arg("--out").arg(&wheels).current_dir(workspace()))?;
-    IS_BUILT.store(true, Ordering::Relaxed);
-    Ok(())
+fn reference(name: &str, packages: &[&str]) -> Result<PathBuf, String> {
+    let base = interpreter(ORIGINAL).ok_or("CPython 3.11 is missing, which the originals require")?;
+    Ok(tools(name, &base, packages)?.join("bin/python"))
 }
 
-/// Whether this run has built the wheel.
-static IS_BUILT: AtomicBool = AtomicBool::new(false);
+/// Builds the wheel with a cargo profile, once in a run; the Rust tests use `dev`.
+fn wheel(profile: &str) -> Result<(), String> {
+    static BUILT: OnceLock<Result<(), String>> = OnceLock::new();
+    let build = || {
+        let bin = environment()?.join("bin");
+        let wheels = target()?.join("wheels");
+        recreate(&wheels)?;
+        let mut maturin = Command::new(bin.join("maturin"));
+        maturin.args(["build", "--locked", "--manifest-path", "bindings/python/Cargo.toml", "--profile", profile]);
+        run(maturin.arg("--interpreter").arg(bin.join("python")).arg("--out").arg(&wheels).current_dir(workspace()))
+    };
+    BUILT.get_or_init(build).clone()
+}
 
-/// Installs the wheel, built in this run if it has not been yet.
+/// Installs the wheel.
 fn install(environment: &Path) -> Result<(), String> {
-    if !IS_BUILT.load(Ordering::Relaxed) {
-        wheel("dev")?;
-    }
+    wheel("dev")?;
     let wheel = files_below(&target()?.join("wheels"))?.pop().ok_or("no wheel has been built")?;
     run(pip_install(environment)?.args(["--reinstall", "--no-deps"]).arg(wheel))
 }
@@ -228,7 +225,7 @@ fn pytest(environment: &Path, package: &str, markers: &str, paths: &[(&str, Path
     run(pytest.envs(paths.iter().cloned()).current_dir(workspace().join(package)))
 }
 
-/// Compares steps per second with the original and, for scale, with EnvPool's environments if EnvPool can be installed.
+/// Compares steps per second with the original.
 pub fn bench(arguments: &[String]) -> Result<(), String> {
     wheel("release")?;
     let environment = environment()?;

@@ -5,11 +5,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::shell::{cargo, cargo_home, describe, files_below, recreate, remap, run, sysroot, target, workspace};
+use crate::shell::{cargo, describe, files_below, folders, recreate, remap, run, target, workspace};
 use crate::{python, web};
 
 /// Maturin as in the tests. Zig links against any version of the C library.
-const TOOLS: [&str; 2] = ["maturin==1.16.0", "ziglang==0.17.1"];
+pub const TOOLS: [&str; 2] = ["maturin==1.16.0", "ziglang==0.17.1"];
 
 /// The oldest C library that the wheel supports; maturin fails if a symbol is newer.
 const PLATFORM: &str = "manylinux_2_17";
@@ -77,8 +77,10 @@ fn page(folder: &Path) -> Result<(), String> {
     let name = versioned("endless-gym-web");
     let options = "--create --gzip --sort=name --mtime=@0 --owner=0 --group=0 --numeric-owner --mode=u=rwX,go=rX";
     let mut tar = Command::new("tar");
-    tar.args(options.split(' '));
-    tar.arg(format!("--transform=s,^\\.,{name},")).arg("--file").arg(folder.join(format!("{name}.tar.gz")));
+    tar.args(options.split(' '))
+        .arg(format!("--transform=s,^\\.,{name},"))
+        .arg("--file")
+        .arg(folder.join(format!("{name}.tar.gz")));
     run(tar.arg("--directory").arg(web::folder()?).arg("."))
 }
 
@@ -127,8 +129,7 @@ fn check_contents(wheel: &Path) -> Result<(), String> {
     if let Some(missing) = LICENCES.iter().find(|licence| !has(licence)) {
         return Err(format!("the wheel must contain {missing}"));
     }
-    let local =
-        [workspace().to_path_buf(), target()?, cargo_home()?, sysroot()?].map(|path| path.display().to_string());
+    let local = folders(workspace())?.map(|(path, _)| path.display().to_string());
     for file in files {
         let bytes = fs::read(&file).map_err(describe(&file))?;
         if let Some(path) = local.iter().find(|path| bytes.windows(path.len()).any(|part| part == path.as_bytes())) {

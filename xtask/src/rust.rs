@@ -1,5 +1,6 @@
 //! Lints, tests and measurements of the crates.
 
+use std::ffi::OsStr;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -21,10 +22,9 @@ pub fn format() -> Result<(), String> {
 
 pub fn clippy() -> Result<(), String> {
     cargo(&["clippy", "--workspace", "--all-targets", "--locked", "--", "--deny", "warnings"])?;
-    for features in [["endless-gym-core", ""], ["endless-gym", ""], ["endless-gym", "service"]] {
-        let [package, features] = features;
-        let selection = ["clippy", "--locked", "--package", package, "--no-default-features", "--features", features];
-        cargo(&[&selection, ["--", "--deny", "warnings"].as_slice()].concat())?;
+    for (package, features) in [("endless-gym-core", ""), ("endless-gym", ""), ("endless-gym", "service")] {
+        let selection = format!("clippy --locked --package {package} --no-default-features --features={features}");
+        cargo(&selection.split(' ').chain(["--", "--deny", "warnings"]).collect::<Vec<_>>())?;
     }
     Ok(())
 }
@@ -55,7 +55,7 @@ pub fn test_ignored() -> Result<(), String> {
 }
 
 /// Says what is not run, and why; an error if the environment variable CI is `true`.
-fn not_run(what: &str) -> Result<(), String> {
+pub fn not_run(what: &str) -> Result<(), String> {
     println!("not run, {what}");
     if std::env::var("CI").as_deref() == Ok("true") { Err(format!("not run, {what}")) } else { Ok(()) }
 }
@@ -95,13 +95,9 @@ pub fn loom() -> Result<(), String> {
     run(cargo.env("CARGO_PROFILE_TEST_OPT_LEVEL", "2"))
 }
 
-/// Runs the fault injection with a fixed seed. A failure prints the command line that repeats it.
-pub fn test_faults() -> Result<(), String> {
-    faults("faults", &["--minutes", "1", "--seed", "1"].map(str::to_owned))
-}
-
-/// Builds the program of `tests/faults` and the engine that it starts, and runs one of the program's commands.
-pub fn faults(command: &str, arguments: &[String]) -> Result<(), String> {
+/// Builds the program of `tests/faults` and the engine that it starts, and runs one of the program's commands. A failure prints the
+/// command line that repeats it.
+pub fn faults(command: &str, arguments: &[impl AsRef<OsStr>]) -> Result<(), String> {
     // With all tests, as they were built before: alone, the programs would have dependencies with other features.
     cargo(&["build", "--locked", "--workspace", "--bins", "--tests"])?;
     run(Command::new(target()?.join("debug/endless-gym-faults")).arg(command).args(arguments))
@@ -124,7 +120,7 @@ pub fn instructions(record: bool) -> Result<(), String> {
         let counting: Vec<_> = lines.iter().map(|(id, _)| scope.spawn(|| count(id))).collect();
         counting.into_iter().map(|count| count.join().map_err(|_| "a count panicked".to_owned()).flatten()).collect()
     });
-    let (mut recorded, mut failures) = (String::new(), Vec::new());
+    let (mut recorded, mut failures) = (String::new(), String::new());
     println!("{:30} {:>24} {:>8}", "environment", "instructions a step", "budget");
     for ((id, budget), count) in lines.into_iter().zip(counts) {
         let budget: u64 = budget.parse().map_err(describe(&file))?;
@@ -132,17 +128,14 @@ pub fn instructions(record: bool) -> Result<(), String> {
         println!("{id:30} {count:24} {budget:8}");
         recorded += &format!("{id} {count}\n");
         if count.abs_diff(budget) * 100 > budget * MARGIN_PERCENT {
-            failures.push(format!("{id}: {count} instructions a step, the budget is {budget} ± {MARGIN_PERCENT} %"));
+            failures += &format!("{id}: {count} instructions a step, the budget is {budget} ± {MARGIN_PERCENT} %\n");
         }
     }
     if record {
         return std::fs::write(&file, recorded).map_err(describe(&file));
     }
-    if failures.is_empty() {
-        return Ok(());
-    }
-    failures.push("if the change is intended, record it: cargo xtask instructions --record".to_owned());
-    Err(failures.join("\n"))
+    let hint = "if the change is intended, record it: cargo xtask instructions --record";
+    if failures.is_empty() { Ok(()) } else { Err(failures + hint) }
 }
 
 /// Instructions of all counted steps of an environment, measured by callgrind.
@@ -151,18 +144,9 @@ fn count(id: &str) -> Result<u64, String> {
     // Keep the C library from using `rep movsb` and `rep stosb`, since callgrind counts each of their bytes as an
     // instruction.
     const TUNABLES: &str = "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000";
-    let runner = format!("CARGO_TARGET_{}_RUNNER", env!("TARGET").to_uppercase().replace('-', "_"));
-    let mut bench = shell::cargo(&[
-        "bench",
-        "--locked",
-        "--package",
-        "endless-gym-memory-gym",
-        "--bench",
-        "instructions",
-        "--",
-        id,
-    ]);
-    let printed = output(bench.env(runner, VALGRIND).env("GLIBC_TUNABLES", TUNABLES))?;
+    let runner = format!("target.'cfg(all())'.runner=\"{VALGRIND}\"");
+    let mut bench = shell::cargo(&["bench", "--locked", "--config", &runner, "--package", "endless-gym-memory-gym"]);
+    let printed = output(bench.args(["--bench", "instructions", "--", id]).env("GLIBC_TUNABLES", TUNABLES))?;
     let collected = printed.lines().find_map(|line| Some(line.split_once("Collected :")?.1.trim()));
     let count = collected.and_then(|count| count.parse().ok()).filter(|count| *count > 0);
     count.ok_or_else(|| format!("callgrind counted no instructions of {id}\n{printed}"))

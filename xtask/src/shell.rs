@@ -16,23 +16,20 @@ pub fn target() -> Result<PathBuf, String> {
     std::path::absolute(target).map_err(|error| error.to_string())
 }
 
-/// The folder of cargo's registry.
-pub fn cargo_home() -> Result<PathBuf, String> {
+/// The folders of this machine that no release may name, with what they are: the target directory, a source, cargo's registry and
+/// the compiler.
+pub fn folders(source: &Path) -> Result<[(PathBuf, &'static str); 4], String> {
     let home = std::env::var_os("CARGO_HOME").map(PathBuf::from);
-    home.or_else(|| Some(std::env::home_dir()?.join(".cargo"))).ok_or_else(|| "CARGO_HOME must be set".to_owned())
-}
-
-/// The folder of the compiler.
-pub fn sysroot() -> Result<PathBuf, String> {
-    Ok(PathBuf::from(output(Command::new("rustc").args(["--print", "sysroot"]))?.trim()))
+    let home = home.or_else(|| Some(std::env::home_dir()?.join(".cargo"))).ok_or("CARGO_HOME must be set")?;
+    let compiler = PathBuf::from(output(Command::new("rustc").args(["--print", "sysroot"]))?.trim());
+    let registry = home.join("registry/src");
+    Ok([(target()?, "target"), (source.into(), "endless-gym"), (registry, "registry"), (compiler, "rust")])
 }
 
 /// Compiler flags that replace paths of this machine in panic messages.
 pub fn remap(source: &Path) -> Result<OsString, String> {
-    let registry = cargo_home()?.join("registry/src");
     // If several match, the compiler applies the last.
-    let folders = [(target()?, "target"), (source.into(), "endless-gym"), (registry, "registry"), (sysroot()?, "rust")];
-    let flags = folders.map(|(from, to)| {
+    let flags = folders(source)?.map(|(from, to)| {
         let mut flag = OsString::from("--remap-path-prefix=");
         flag.push(from);
         flag.push(format!("={to}"));
@@ -72,6 +69,11 @@ pub fn output(command: &mut Command) -> Result<String, String> {
 /// Whether a command can be run and succeeds.
 pub fn succeeds(command: &mut Command) -> bool {
     command.stdin(Stdio::null()).output().is_ok_and(|output| output.status.success())
+}
+
+/// Whether there is a program of that name.
+pub fn has(program: &str) -> bool {
+    succeeds(Command::new(program).arg("--version"))
 }
 
 /// Empties a folder, or creates it.

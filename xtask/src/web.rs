@@ -2,14 +2,14 @@
 //! and the files of `engine/page/files`.
 
 use std::fs;
-use std::io::Write;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use flate2::Compression;
-use flate2::write::GzEncoder;
+use flate2::read::GzEncoder;
 
-use crate::shell::{cargo, describe, output, recreate, remap, run, succeeds, target, workspace};
+use crate::shell::{cargo, describe, has, output, recreate, remap, run, target, workspace};
 
 const TARGET: &str = "wasm32-unknown-unknown";
 
@@ -18,7 +18,7 @@ pub const MISSING: &str = "Rust's standard library for wasm32-unknown-unknown; r
     .ci/wasm-toolchain, which unpacks Debian's compiler under target/";
 
 /// Limit of the total bytes of all files, each compressed, which a browser downloads at most.
-const LIMIT: usize = 600_000;
+const LIMIT: u64 = 600_000;
 
 /// A compiler with the target's standard library, or with its sources.
 pub enum Toolchain {
@@ -37,20 +37,6 @@ impl Toolchain {
         }
         let folder = target().ok()?.join("wasm-toolchain/usr");
         folder.join("bin/rustc").exists().then_some(Toolchain::Debian(folder))
-    }
-
-    /// Builds a library as WebAssembly, and returns the output folder. Its manifest does not ask for that type: cargo would then build
-    /// it for every crate that depends on the library, under the same name.
-    fn build(&self, arguments: &[&str]) -> Result<PathBuf, String> {
-        let mut cargo =
-            cargo(&["rustc", "--locked", "--release", "--target", TARGET, "--lib", "--crate-type", "cdylib"]);
-        cargo.args(arguments);
-        // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
-        cargo.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
-        cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
-        let built = self.set(&mut cargo)?;
-        run(&mut cargo)?;
-        Ok(built.join(TARGET).join("release"))
     }
 
     /// Sets the variables with which cargo, or a command that runs it, builds with this compiler, and returns the target
@@ -80,7 +66,7 @@ impl Toolchain {
 pub fn has_browser() -> bool {
     let given = std::env::var("CHROMIUM").into_iter();
     let mut programs = given.chain(["chromium", "chromium-browser", "google-chrome"].map(str::to_owned));
-    programs.any(|program| succeeds(Command::new(program).arg("--version")))
+    programs.any(|program| has(&program))
 }
 
 /// Where the page is built.
@@ -90,8 +76,16 @@ pub fn folder() -> Result<PathBuf, String> {
 
 /// Builds the page. Fails if there is no compiler for WebAssembly, or if the page is too large.
 pub fn build() -> Result<(), String> {
-    let built = Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-web"])?;
-    let engine = built.join("endless_gym_web.wasm");
+    // The manifest does not ask for a `cdylib`: cargo would then build one for every crate that depends on the library, under the same
+    // name.
+    let package = ["rustc", "--locked", "--release", "--package", "endless-gym-web", "--lib", "--crate-type", "cdylib"];
+    let mut cargo = cargo(&package);
+    // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
+    cargo.args(["--target", TARGET]).env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
+    cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
+    let built = Toolchain::find().ok_or(MISSING)?.set(&mut cargo)?;
+    run(&mut cargo)?;
+    let engine = built.join(TARGET).join("release/endless_gym_web.wasm");
     let engine = fs::read(&engine).map_err(describe(&engine))?;
     let files = endless_gym_page::files(&engine, |_| true);
     write(&folder()?, &files)?;
@@ -100,7 +94,9 @@ pub fn build() -> Result<(), String> {
     if fs::read(embedded.join("engine.wasm")).ok().as_ref() != Some(&engine) {
         write(&embedded, &[("engine.wasm", engine)])?;
     }
-    let compressed = files.iter().map(|(_, bytes)| compressed(bytes)).sum::<usize>();
+    let compress = |bytes: &[u8]| io::copy(&mut GzEncoder::new(bytes, Compression::default()), &mut io::sink());
+    // Reading from memory does not fail.
+    let compressed: u64 = files.iter().flat_map(|(_, bytes)| compress(bytes)).sum();
     println!("    {} files, {compressed} bytes compressed, {}", files.len(), folder()?.join("index.html").display());
     if compressed > LIMIT {
         return Err(format!("the page must be at most {LIMIT} bytes compressed, got {compressed}"));
@@ -169,11 +165,4 @@ fn write(folder: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), String> {
         let path = folder.join(name);
         fs::write(&path, bytes).map_err(describe(&path))
     })
-}
-
-fn compressed(bytes: &[u8]) -> usize {
-    let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
-    // Writing to memory does not fail.
-    let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
-    written.map_or(bytes.len(), |bytes| bytes.len())
 }
