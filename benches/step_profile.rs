@@ -9,7 +9,7 @@
 use std::hint::black_box;
 use std::sync::Arc;
 
-use endless_gym_core::batch::Block;
+use endless_gym_core::batch::{BatchBuffer, Block};
 use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters};
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
@@ -18,9 +18,9 @@ use endless_gym_memory_gym::mortar_mayhem::{self, MortarMayhem};
 use endless_gym_memory_gym::mystery_path::{self, MysteryPath};
 use endless_gym_memory_gym::searing_spotlights::{self, SearingSpotlights};
 use endless_gym_memory_gym::{FRAME, SCREEN, memory_gym};
-use memmap2::{Advice, MmapMut};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
+use rustix::mm::{Advice, madvise};
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::Map;
 
@@ -138,12 +138,14 @@ impl<E: Environment> Players<E> {
 type Step = Box<dyn FnMut()>;
 
 /// Memory that a step writes to, in small or in huge pages.
-fn memory(bytes: usize, huge: bool) -> MmapMut {
-    let memory = MmapMut::map_anon(bytes).unwrap();
-    if huge {
-        memory.advise(Advice::HugePage).unwrap();
-    } else {
-        memory.advise(Advice::NoHugePage).unwrap();
+fn memory(blocks: usize, huge: bool) -> BatchBuffer {
+    let mut memory = BatchBuffer::new(blocks);
+    let page = rustix::param::page_size();
+    let (start, bytes) = (memory.as_mut_ptr(), size_of_val(&memory[..]));
+    let before = start.addr().wrapping_neg() % page;
+    if !huge && bytes > before {
+        // SAFETY: whole pages of the buffer, whose content the advice does not change.
+        unsafe { madvise(start.wrapping_byte_add(before).cast(), bytes - before, Advice::LinuxNoHugepage) }.unwrap();
     }
     memory
 }
@@ -151,10 +153,10 @@ fn memory(bytes: usize, huge: bool) -> MmapMut {
 fn pool_step(spec: &'static EnvSpec, num_envs: usize, huge: bool) -> Step {
     let config = PoolConfig::new(spec.id, num_envs).seeding(Seeding::Continue { seed: Some(1) });
     let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
-    let mut batch = memory(pool.layout().blocks() * size_of::<Block>(), huge);
+    let mut batch = memory(pool.layout().blocks(), huge);
     let mut actions = Actions::new(spec, num_envs);
-    pool.reset(ResetRequest::All, bytemuck::cast_slice_mut(&mut batch)).unwrap();
-    let mut step = move || pool.step(actions.next(), bytemuck::cast_slice_mut(&mut batch)).unwrap();
+    pool.reset(ResetRequest::All, &mut batch).unwrap();
+    let mut step = move || pool.step(actions.next(), &mut batch).unwrap();
     for _ in 0..WARM_UP {
         step();
     }
@@ -169,9 +171,10 @@ fn player_step<E: Environment + 'static, const PHASE: u8>(
     huge: bool,
 ) -> Step {
     let mut players = Players::<E>::new(spec, variant, num_envs, WARM_UP);
-    let mut frames = memory(frames * FRAME.bytes(), huge);
-    players.paint(&mut frames);
-    Box::new(move || players.step::<PHASE>(&mut frames))
+    let bytes = frames * FRAME.bytes();
+    let mut frames = memory(bytes.div_ceil(size_of::<Block>()), huge);
+    players.paint(&mut bytemuck::cast_slice_mut(&mut frames)[..bytes]);
+    Box::new(move || players.step::<PHASE>(&mut bytemuck::cast_slice_mut(&mut frames)[..bytes]))
 }
 
 /// CPU time of this thread, in nanoseconds.

@@ -9,6 +9,8 @@ use std::time::Duration;
 use endless_gym_core::pool::PoolError;
 use endless_gym_core::random::Generator;
 use endless_gym_service::{BatchLease, ConnectConfig, GroupReconnection, LastRequest, ServiceError, Trainer};
+use nix::unistd::ForkResult;
+use rustix::process::{Signal, getpid, kill_process};
 use serde::{Deserialize, Serialize};
 
 use crate::checker::{Request, Twin, checksum};
@@ -306,14 +308,13 @@ fn retry<T>(mut call: impl FnMut() -> Result<T, ServiceError>) -> Result<T, Serv
 
 /// Forks a child as a data loader would: it keeps all descriptors and memory, and does not exec another program.
 fn fork() {
-    // SAFETY: the child calls only `sleep` and `_exit`, which are async-signal-safe.
-    let child = unsafe {
-        let child = libc::fork();
-        if child == 0 {
-            libc::sleep(120);
-            libc::_exit(0);
-        }
-        child
-    };
-    Event::Forked { child: child.unsigned_abs() }.report();
+    // SAFETY: the child only makes system calls, which are async-signal-safe.
+    match unsafe { nix::unistd::fork() } {
+        Ok(ForkResult::Child) => loop {
+            std::thread::sleep(Duration::from_secs(120));
+            let _ = kill_process(getpid(), Signal::KILL);
+        },
+        Ok(ForkResult::Parent { child }) => Event::Forked { child: child.as_raw().unsigned_abs() }.report(),
+        Err(error) => panic!("cannot fork: {error}"),
+    }
 }

@@ -64,8 +64,11 @@ impl DerefMut for BatchBuffer {
 }
 
 #[cfg(all(feature = "huge-pages", target_os = "linux"))]
+#[allow(unsafe_code)] // Calls the kernel.
 mod mapped {
-    use memmap2::{Advice, MmapMut};
+    use std::ptr::{NonNull, null_mut};
+
+    use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap_anonymous, munmap};
 
     use crate::batch::block::{BLOCK_BYTES, Block};
 
@@ -78,10 +81,16 @@ mod mapped {
     /// An anonymous mapping that is advised to use huge pages.
     #[derive(Debug)]
     pub struct Mapped {
-        map: MmapMut,
-        /// Bytes of the blocks; the mapping may be longer.
-        bytes: usize,
+        start: NonNull<Block>,
+        blocks: usize,
+        /// Bytes of the mapping, which may be longer than the blocks.
+        length: usize,
     }
+
+    // SAFETY: it owns its memory, as a `Vec` does.
+    unsafe impl Send for Mapped {}
+    // SAFETY: as above.
+    unsafe impl Sync for Mapped {}
 
     impl Mapped {
         /// `None` below [`LEAST_BYTES`], or if the kernel has no huge pages or refuses the mapping.
@@ -91,18 +100,32 @@ mod mapped {
                 return None;
             }
             // Linux (6.7 and later) aligns a mapping to huge pages if its length is a multiple of them.
-            let map = MmapMut::map_anon(bytes.checked_next_multiple_of(HUGE_PAGE)?).ok()?;
+            let length = bytes.checked_next_multiple_of(HUGE_PAGE)?;
+            let protection = ProtFlags::READ | ProtFlags::WRITE;
+            // SAFETY: a new mapping at an address of the kernel's choice.
+            let start = unsafe { mmap_anonymous(null_mut(), length, protection, MapFlags::PRIVATE) }.ok()?;
+            let mapped = Mapped { start: NonNull::new(start.cast())?, blocks, length };
             // Only whole huge pages, so that the rest of the last one takes no memory.
-            map.advise_range(Advice::HugePage, 0, bytes - bytes % HUGE_PAGE).ok()?;
-            Some(Mapped { map, bytes })
+            // SAFETY: the range is in the mapping, whose content the advice does not change.
+            unsafe { madvise(start, bytes - bytes % HUGE_PAGE, Advice::LinuxHugepage) }.ok()?;
+            Some(mapped)
         }
 
         pub fn blocks(&self) -> &[Block] {
-            bytemuck::cast_slice(&self.map[..self.bytes])
+            // SAFETY: the mapping has that many blocks, at first of zeros, and lives as long as `self`.
+            unsafe { std::slice::from_raw_parts(self.start.as_ptr(), self.blocks) }
         }
 
         pub fn blocks_mut(&mut self) -> &mut [Block] {
-            bytemuck::cast_slice_mut(&mut self.map[..self.bytes])
+            // SAFETY: as in `blocks`; `self` is borrowed exclusively.
+            unsafe { std::slice::from_raw_parts_mut(self.start.as_ptr(), self.blocks) }
+        }
+    }
+
+    impl Drop for Mapped {
+        fn drop(&mut self) {
+            // SAFETY: the whole mapping, which nothing borrows any more.
+            let _ = unsafe { munmap(self.start.as_ptr().cast(), self.length) };
         }
     }
 }
