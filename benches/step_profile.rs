@@ -240,7 +240,7 @@ fn main() {
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     println!("| id | environments | rules | scene | compare | paint | own frames | pool | all | huge pages |");
     println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
-    all_times::<MortarMayhem>(mortar_mayhem::IDS, &arguments);
-    all_times::<MysteryPath>(mystery_path::IDS, &arguments);
-    all_times::<SearingSpotlights>(searing_spotlights::IDS, &arguments);
+    all_times::<MortarMayhem>(&*mortar_mayhem::IDS, &arguments);
+    all_times::<MysteryPath>(&*mystery_path::IDS, &arguments);
+    all_times::<SearingSpotlights>(&*searing_spotlights::IDS, &arguments);
 }

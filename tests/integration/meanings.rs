@@ -1,5 +1,7 @@
 //! Tests that the registry's descriptions of actions and ground truth match the rules.
 
+use std::collections::BTreeSet;
+
 use crate::support::player::Player;
 use endless_gym::batch::Batch;
 use endless_gym::envs::EnvSpec;
@@ -82,6 +84,8 @@ fn every_action_and_column_has_a_description() {
         assert_eq!(spec.ground_truth.len(), player.batch().ground_truth().len(), "{}", spec.id);
         assert_eq!(spec.features.len(), player.batch().features().len(), "{}", spec.id);
         let columns = spec.ground_truth.iter().chain(spec.features).map(|column| (column.name, column.description));
+        let unique: BTreeSet<_> = spec.features.iter().map(|column| column.name).collect();
+        assert_eq!(unique.len(), spec.features.len(), "{}: names of features are unique", spec.id);
         let choices = spec.actions.iter().flat_map(|branch| branch.choices);
         for (name, description) in columns.chain(choices.map(|choice| (choice.name, choice.description))) {
             assert!(!name.is_empty() && description.len() > 5, "{}: {name}", spec.id);

@@ -1,6 +1,24 @@
-//! The meaning of actions that several ids share.
+//! What several ids share: the meaning of their actions, and specifications with them.
 
-use endless_gym_core::envs::{ActionBranch, Choice};
+use endless_gym_core::envs::{ActionBranch, ActionSpace, Choice, EnvSpec, Parameter};
+
+use crate::screen::FRAME;
+
+/// The specification of an id with frames, these actions, and a ground truth from 0 to 1.
+pub(crate) fn spec(id: &'static str, summary: &'static str, actions: &'static [ActionBranch]) -> EnvSpec {
+    let choices = |branch: &ActionBranch| branch.choices.len() as i32;
+    let action_space = match actions {
+        [branch] => ActionSpace::Discrete(choices(branch)),
+        branches => ActionSpace::MultiDiscrete(branches.iter().map(choices).collect()),
+    };
+    let shared = EnvSpec::new(id, summary, action_space);
+    EnvSpec { actions, frame: Some(FRAME), ground_truth_bounds: Some((0.0, 1.0)), ..shared }
+}
+
+/// The step limit of an id.
+pub(crate) const fn max_steps(default: i64) -> Parameter {
+    Parameter::int("max_steps", default, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1.")
+}
 
 const fn choice(name: &'static str, description: &'static str) -> Choice {
     Choice { name, description }

@@ -12,6 +12,7 @@ pub mod mortar_mayhem;
 pub mod mystery_path;
 mod screen;
 pub mod searing_spotlights;
+mod shared_methods;
 mod vector;
 
 #[cfg(test)]
@@ -39,9 +40,9 @@ pub const DEFAULT_ENV_ID: &str = "Endless-MortarMayhem-v0";
 pub fn memory_gym() -> &'static Registry {
     static REGISTRY: LazyLock<Registry> = LazyLock::new(|| {
         let mut registry = Registry::new();
-        add::<MortarMayhem>(&mut registry, mortar_mayhem::IDS);
-        add::<MysteryPath>(&mut registry, mystery_path::IDS);
-        add::<SearingSpotlights>(&mut registry, searing_spotlights::IDS);
+        add::<MortarMayhem>(&mut registry, &*mortar_mayhem::IDS);
+        add::<MysteryPath>(&mut registry, &*mystery_path::IDS);
+        add::<SearingSpotlights>(&mut registry, &*searing_spotlights::IDS);
         registry
     });
     &REGISTRY

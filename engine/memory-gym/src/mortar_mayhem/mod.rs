@@ -21,10 +21,8 @@ pub use registry::IDS;
 pub use state::State;
 
 use crate::character_sprites::CharacterSprites;
-use endless_gym_core::envs::Expert;
-use endless_gym_core::envs::Progress;
-use endless_gym_core::envs::ResetParameters;
-use endless_gym_core::envs::{Environment, InvalidState, Transition};
+use crate::shared_methods::shared_methods;
+use endless_gym_core::envs::{Environment, Expert, InvalidState};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use state::DisplayedCharacter;
@@ -39,14 +37,7 @@ pub struct MortarMayhem {
 }
 
 impl Environment for MortarMayhem {
-    type Variant = Variant;
-    type Assets = Assets;
-    type State = State;
-    type Scene = Scene;
-
-    fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
-        Assets::new(variant, Parameters::new(variant, parameters))
-    }
+    shared_methods!();
 
     fn new(assets: &Arc<Assets>) -> Self {
         MortarMayhem { assets: Arc::clone(assets), state: State::new(), earlier_sprites: Arc::clone(&assets.character) }
@@ -66,20 +57,8 @@ impl Environment for MortarMayhem {
         self.state.reset(&assets.config, last_scale, random);
     }
 
-    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
-        self.state.step(&self.assets.config, action, random)
-    }
-
-    fn shared(&self) -> &Arc<Assets> {
-        &self.assets
-    }
-
     fn scene(&self) -> Scene {
         Scene::new(&self.state, &self.assets.config, &self.assets.character, &self.earlier_sprites)
-    }
-
-    fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
-        scene.paint(assets, canvas);
     }
 
     fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
@@ -101,17 +80,9 @@ impl Environment for MortarMayhem {
         }
     }
 
-    fn features(&self, out: &mut [f32]) {
-        self.state.write_features(&self.assets.config, out);
-    }
-
     fn ground_truth(&self, out: &mut [f64]) {
         let (x, y) = self.state.target;
         out.copy_from_slice(&[f64::from(x) / 5.0, f64::from(y) / 5.0]);
-    }
-
-    fn state(&self) -> &State {
-        &self.state
     }
 
     fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
@@ -122,10 +93,6 @@ impl Environment for MortarMayhem {
         self.earlier_sprites = assets.displayed_sprites(&state);
         self.state = state;
         Ok(())
-    }
-
-    fn progress(&self) -> Vec<Progress> {
-        self.state.progress(&self.assets.config)
     }
 
     fn info(&self, out: &mut [f64]) {

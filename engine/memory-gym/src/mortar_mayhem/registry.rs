@@ -6,11 +6,10 @@
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION, Variant};
-use crate::controls::{MOVE, TURN_AND_WALK};
-use crate::screen::spec;
-use endless_gym_core::envs::ActionSpace;
-use endless_gym_core::envs::Parameter;
-use endless_gym_core::envs::{ActionBranch, Column, EnvSpec, InfoColumn, Learnt, Metric};
+use std::sync::LazyLock;
+
+use crate::controls::{MOVE, TURN_AND_WALK, max_steps, spec};
+use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Learnt, Metric, Parameter};
 
 const AGENT_SCALE: Parameter = Parameter::float(
     "agent_scale",
@@ -51,70 +50,37 @@ const REWARD_COMMAND_SUCCESS: Parameter =
 const REWARD_EPISODE_SUCCESS: Parameter =
     Parameter::reward("reward_episode_success", 0.0, "Reward for executing the whole sequence.");
 
-const fn finite_command_count(max: i64) -> Parameter {
-    Parameter::list("command_count", &[10], 1, max, COMMAND_COUNT)
+/// The parameters of a finite id: the speed, if the agent moves freely; the default number of allowed commands; the largest number of
+/// commands; what depends on their being shown; the default duration and delay of explosions.
+macro_rules! finite {
+    ([$($speed:expr)?], $allowed:expr, $max:expr, [$($shown:expr),*], $duration:expr, $delay:expr) => {
+        &[
+            AGENT_SCALE,
+            $($speed,)?
+            ARENA_SIZE,
+            Parameter::int("allowed_commands", $allowed, 4, 9, ALLOWED_COMMANDS),
+            Parameter::list("command_count", &[10], 1, $max, COMMAND_COUNT),
+            $($shown,)*
+            Parameter::list("explosion_duration", &[$duration], 1, MAX_DURATION, EXPLOSION_DURATION),
+            Parameter::list("explosion_delay", &[$delay], 1, MAX_DURATION, EXPLOSION_DELAY),
+            VISUAL_FEEDBACK,
+            REWARD_COMMAND_FAILURE,
+            REWARD_COMMAND_SUCCESS,
+            REWARD_EPISODE_SUCCESS,
+        ]
+    };
 }
 
-const MORTAR_MAYHEM: &[Parameter] = &[
-    AGENT_SCALE,
-    AGENT_SPEED,
-    ARENA_SIZE,
-    Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
-    finite_command_count(MAX_COMMANDS),
-    COMMAND_SHOW_DURATION,
-    COMMAND_SHOW_DELAY,
-    Parameter::list("explosion_duration", &[6], 1, MAX_DURATION, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[18], 1, MAX_DURATION, EXPLOSION_DELAY),
-    VISUAL_FEEDBACK,
-    REWARD_COMMAND_FAILURE,
-    REWARD_COMMAND_SUCCESS,
-    REWARD_EPISODE_SUCCESS,
-];
-
-const MORTAR_MAYHEM_GRID: &[Parameter] = &[
-    AGENT_SCALE,
-    ARENA_SIZE,
-    Parameter::int("allowed_commands", 5, 4, 9, ALLOWED_COMMANDS),
-    finite_command_count(MAX_COMMANDS),
-    COMMAND_SHOW_DURATION,
-    COMMAND_SHOW_DELAY,
-    Parameter::list("explosion_duration", &[2], 1, MAX_DURATION, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[6], 1, MAX_DURATION, EXPLOSION_DELAY),
-    VISUAL_FEEDBACK,
-    REWARD_COMMAND_FAILURE,
-    REWARD_COMMAND_SUCCESS,
-    REWARD_EPISODE_SUCCESS,
-];
-
-const MORTAR_MAYHEM_B: &[Parameter] = &[
-    AGENT_SCALE,
-    AGENT_SPEED,
-    ARENA_SIZE,
-    Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
-    finite_command_count(MAX_VECTOR_COMMANDS as i64),
-    Parameter::list("explosion_duration", &[6], 1, MAX_DURATION, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[18], 1, MAX_DURATION, EXPLOSION_DELAY),
-    VISUAL_FEEDBACK,
-    REWARD_COMMAND_FAILURE,
-    REWARD_COMMAND_SUCCESS,
-    REWARD_EPISODE_SUCCESS,
-];
-
-const MORTAR_MAYHEM_B_GRID: &[Parameter] = &[
-    AGENT_SCALE,
-    ARENA_SIZE,
-    Parameter::int("allowed_commands", 5, 4, 9, ALLOWED_COMMANDS),
-    finite_command_count(MAX_VECTOR_COMMANDS as i64),
-    Parameter::list("explosion_duration", &[2], 1, MAX_DURATION, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[6], 1, MAX_DURATION, EXPLOSION_DELAY),
-    VISUAL_FEEDBACK,
-    REWARD_COMMAND_FAILURE,
-    REWARD_COMMAND_SUCCESS,
-    REWARD_EPISODE_SUCCESS,
-];
+const GIVEN: i64 = MAX_VECTOR_COMMANDS as i64;
+const MORTAR_MAYHEM: &[Parameter] =
+    finite!([AGENT_SPEED], 9, MAX_COMMANDS, [COMMAND_SHOW_DURATION, COMMAND_SHOW_DELAY], 6, 18);
+const MORTAR_MAYHEM_GRID: &[Parameter] =
+    finite!([], 5, MAX_COMMANDS, [COMMAND_SHOW_DURATION, COMMAND_SHOW_DELAY], 2, 6);
+const MORTAR_MAYHEM_B: &[Parameter] = finite!([AGENT_SPEED], 9, GIVEN, [], 6, 18);
+const MORTAR_MAYHEM_B_GRID: &[Parameter] = finite!([], 5, GIVEN, [], 2, 6);
 
 const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
-    Parameter::int("max_steps", -1, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1."),
+    max_steps(-1),
     AGENT_SCALE,
     AGENT_SPEED,
     Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
@@ -163,102 +129,46 @@ const GROUND_TRUTH: &[Column] = &[
     Column { name: "target_y", description: "row of that tile, from the top, divided by 5" },
 ];
 
-/// The specification of a finite id.
-const fn finite(
-    id: &'static str,
-    summary: &'static str,
-    action_space: ActionSpace,
-    actions: &'static [ActionBranch],
-) -> EnvSpec {
-    let mut spec = spec(id, summary, action_space, actions);
-    spec.info = FINITE_INFO;
-    spec.features = FEATURES;
-    spec.metric = Metric::TASK_PROGRESS;
-    spec.learnt = Some(Learnt::by(InfoColumn::TASK_PROGRESS.name));
-    // The most commands, each shown and executed for the longest time.
-    spec.step_limit = |given| {
-        let most = |name| given.int_list(name).into_iter().max().unwrap_or(0);
-        let (shown, burning) = (most("command_show_duration") + most("command_show_delay"), most("explosion_duration"));
-        Some((shown + burning + most("explosion_delay")) * most("command_count") - burning + 1)
-    };
-    spec
-}
-
 /// The five ids of the family.
-pub const IDS: &[(EnvSpec, Variant)] = &[
-    (
-        {
-            let mut spec = finite(
-                "MortarMayhem-v0",
-                "Memorise a sequence of shown commands, then walk it tile by tile",
-                ActionSpace::multi_discrete(&[3, 3]),
-                MOVE,
-            );
-            spec.parameters = MORTAR_MAYHEM;
-            spec
+pub static IDS: LazyLock<[(EnvSpec, Variant); 5]> = LazyLock::new(|| {
+    let finite = |id, summary, actions, parameters| EnvSpec {
+        info: FINITE_INFO,
+        features: FEATURES,
+        parameters,
+        metric: Metric::TASK_PROGRESS,
+        learnt: Some(Learnt::by(InfoColumn::TASK_PROGRESS.name)),
+        // The most commands, each shown and executed for the longest time.
+        step_limit: |given| {
+            let most = |name| given.int_list(name).into_iter().max().unwrap_or(0);
+            let (shown, burning) = (most("command_show_duration") + most("command_show_delay"), most("explosion_duration"));
+            Some((shown + burning + most("explosion_delay")) * most("command_count") - burning + 1)
         },
-        Variant { locomotion: Locomotion::Free, commands_given: false, endless: false, start_offset: false },
-    ),
-    (
-        {
-            let mut spec = finite(
-                "MortarMayhem-Grid-v0",
-                "Mortar Mayhem with turning and walking from tile to tile",
-                ActionSpace::Discrete(4),
-                TURN_AND_WALK,
-            );
-            spec.parameters = MORTAR_MAYHEM_GRID;
-            spec.render_fps = 6;
-            spec
-        },
-        Variant { locomotion: Locomotion::Grid, commands_given: false, endless: false, start_offset: false },
-    ),
-    (
-        {
-            let mut spec = finite(
-                "MortarMayhemB-v0",
-                "Mortar Mayhem without memory: the commands are always observed as a vector",
-                ActionSpace::multi_discrete(&[3, 3]),
-                MOVE,
-            );
-            spec.vector_observation = MAX_VECTOR_COMMANDS * COMMANDS;
-            spec.parameters = MORTAR_MAYHEM_B;
-            spec
-        },
-        Variant { locomotion: Locomotion::Free, commands_given: true, endless: false, start_offset: true },
-    ),
-    (
-        {
-            let mut spec = finite(
-                "MortarMayhemB-Grid-v0",
-                "Mortar Mayhem without memory, on a grid",
-                ActionSpace::Discrete(4),
-                TURN_AND_WALK,
-            );
-            spec.vector_observation = MAX_VECTOR_COMMANDS * COMMANDS;
-            spec.parameters = MORTAR_MAYHEM_B_GRID;
-            spec.render_fps = 1;
-            spec
-        },
-        Variant { locomotion: Locomotion::Grid, commands_given: true, endless: false, start_offset: false },
-    ),
-    (
-        {
-            let mut spec = spec(
-                "Endless-MortarMayhem-v0",
-                "Each time the sequence is executed it grows by one shown command, until the agent fails",
-                ActionSpace::multi_discrete(&[3, 3]),
-                MOVE,
-            );
-            spec.ground_truth = GROUND_TRUTH;
-            spec.info = ENDLESS_INFO;
-            spec.features = FEATURES;
-            spec.keeps_state = true;
-            spec.parameters = ENDLESS_MORTAR_MAYHEM;
-            spec.metric = Metric { name: "commands_completed", label: "Commands" };
-            spec.learnt = None;
-            spec
-        },
-        Variant { locomotion: Locomotion::Wrapping, commands_given: false, endless: true, start_offset: true },
-    ),
-];
+        ..spec(id, summary, actions)
+    };
+    let summary = "Memorise a sequence of shown commands, then walk it tile by tile";
+    let free = finite("MortarMayhem-v0", summary, MOVE, MORTAR_MAYHEM);
+    let summary = "Mortar Mayhem with turning and walking from tile to tile";
+    let grid = finite("MortarMayhem-Grid-v0", summary, TURN_AND_WALK, MORTAR_MAYHEM_GRID);
+    let summary = "Mortar Mayhem without memory: the commands are always observed as a vector";
+    let given = finite("MortarMayhemB-v0", summary, MOVE, MORTAR_MAYHEM_B);
+    let summary = "Mortar Mayhem without memory, on a grid";
+    let given_grid = finite("MortarMayhemB-Grid-v0", summary, TURN_AND_WALK, MORTAR_MAYHEM_B_GRID);
+    let summary = "Each time the sequence is executed it grows by one shown command, until the agent fails";
+    let endless = spec("Endless-MortarMayhem-v0", summary, MOVE);
+    let (features, parameters) = (FEATURES, ENDLESS_MORTAR_MAYHEM);
+    let metric = Metric { name: "commands_completed", label: "Commands" };
+    let endless = EnvSpec { features, parameters, metric, learnt: None, ..endless };
+    let vector_observation = MAX_VECTOR_COMMANDS * COMMANDS;
+    let variant = Variant { locomotion: Locomotion::Free, commands_given: false, endless: false, start_offset: false };
+    let on_grid = Variant { locomotion: Locomotion::Grid, ..variant };
+    [
+        (free, variant),
+        (EnvSpec { render_fps: 6, ..grid }, on_grid),
+        (EnvSpec { vector_observation, ..given }, Variant { commands_given: true, start_offset: true, ..variant }),
+        (EnvSpec { vector_observation, render_fps: 1, ..given_grid }, Variant { commands_given: true, ..on_grid }),
+        (
+            EnvSpec { ground_truth: GROUND_TRUTH, info: ENDLESS_INFO, keeps_state: true, ..endless },
+            Variant { locomotion: Locomotion::Wrapping, endless: true, start_offset: true, ..variant },
+        ),
+    ]
+});

@@ -38,10 +38,8 @@ pub use registry::IDS;
 pub use scene::Scene;
 pub use state::State;
 
-use endless_gym_core::envs::Expert;
-use endless_gym_core::envs::Progress;
-use endless_gym_core::envs::ResetParameters;
-use endless_gym_core::envs::{Environment, InvalidState, Transition};
+use crate::shared_methods::shared_methods;
+use endless_gym_core::envs::{Environment, Expert, InvalidState};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 
@@ -53,14 +51,7 @@ pub struct MysteryPath {
 }
 
 impl Environment for MysteryPath {
-    type Variant = Variant;
-    type Assets = Assets;
-    type State = State;
-    type Scene = Scene;
-
-    fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
-        Assets::new(variant, Parameters::new(variant, parameters))
-    }
+    shared_methods!();
 
     fn new(assets: &Arc<Assets>) -> Self {
         MysteryPath { assets: Arc::clone(assets), state: State::default() }
@@ -73,20 +64,8 @@ impl Environment for MysteryPath {
         self.state.reset(&assets.config, random);
     }
 
-    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
-        self.state.step(&self.assets.config, action, random)
-    }
-
-    fn shared(&self) -> &Arc<Assets> {
-        &self.assets
-    }
-
     fn scene(&self) -> Scene {
         self.state.scene(&self.assets.config)
-    }
-
-    fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
-        scene.paint(assets, canvas);
     }
 
     fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
@@ -97,19 +76,11 @@ impl Environment for MysteryPath {
         self.assets.draw_ground_truth(&self.state, canvas);
     }
 
-    fn features(&self, out: &mut [f32]) {
-        self.state.write_features(&self.assets.config, out);
-    }
-
     fn ground_truth(&self, out: &mut [f64]) {
         out.fill(0.0);
         if self.assets.config.variant == Variant::Endless {
             out[self.state.endless.direction() as usize] = 1.0;
         }
-    }
-
-    fn state(&self) -> &State {
-        &self.state
     }
 
     fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
@@ -119,10 +90,6 @@ impl Environment for MysteryPath {
         self.assets = Arc::clone(assets);
         self.state = state;
         Ok(())
-    }
-
-    fn progress(&self) -> Vec<Progress> {
-        self.state.progress(&self.assets.config)
     }
 
     fn info(&self, out: &mut [f64]) {

@@ -5,16 +5,11 @@
 
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
-use crate::controls::{FOLLOW, MOVE, TURN_AND_WALK};
-use crate::screen::SCREEN;
-use crate::screen::spec;
-use endless_gym_core::envs::ActionSpace;
-use endless_gym_core::envs::Parameter;
-use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric};
+use std::sync::LazyLock;
 
-const fn max_steps(default: i64) -> Parameter {
-    Parameter::int("max_steps", default, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1.")
-}
+use crate::controls::{FOLLOW, MOVE, TURN_AND_WALK, max_steps, spec};
+use crate::screen::SCREEN;
+use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, Parameter};
 
 const fn reward_path_progress(default: f64) -> Parameter {
     Parameter::reward("reward_path_progress", default, "Reward for reaching a tile of the path for the first time.")
@@ -136,57 +131,28 @@ const GROUND_TRUTH: &[Column] = &[
 ];
 
 /// The three ids of the family.
-pub const IDS: &[(EnvSpec, Variant)] = &[
-    (
-        {
-            let mut spec = spec(
-                "MysteryPath-v0",
-                "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
-                ActionSpace::multi_discrete(&[3, 3]),
-                MOVE,
-            );
-            spec.info = FINITE_INFO;
-            spec.features = FINITE_FEATURES;
-            spec.parameters = MYSTERY_PATH;
-            spec.metric = Metric::TASK_PROGRESS;
-            spec
-        },
-        Variant::Free,
-    ),
-    (
-        {
-            let mut spec = spec(
-                "MysteryPath-Grid-v0",
-                "Mystery Path with turning and walking from tile to tile",
-                ActionSpace::Discrete(4),
-                TURN_AND_WALK,
-            );
-            spec.info = FINITE_INFO;
-            spec.features = FINITE_FEATURES;
-            spec.parameters = MYSTERY_PATH_GRID;
-            spec.metric = Metric::TASK_PROGRESS;
-            spec.render_fps = 3;
-            spec
-        },
-        Variant::Grid,
-    ),
-    (
-        {
-            let mut spec = spec(
-                "Endless-MysteryPath-v0",
-                "Follow an endless invisible path; a fall before the farthest column, or twice at the same tile, ends the episode",
-                ActionSpace::Discrete(4),
-                FOLLOW,
-            );
-            spec.ground_truth = GROUND_TRUTH;
-            spec.ground_truth_is_integer = true;
-            spec.info = ENDLESS_INFO;
-            spec.features = ENDLESS_FEATURES;
-            spec.parameters = ENDLESS_MYSTERY_PATH;
-            spec.metric = Metric { name: "tiles_visited", label: "Tiles" };
-            spec.learnt = None;
-            spec
-        },
-        Variant::Endless,
-    ),
-];
+pub static IDS: LazyLock<[(EnvSpec, Variant); 3]> = LazyLock::new(|| {
+    let summary = "Find an invisible path to the goal; the agent starts over after a fall and must remember the path";
+    let free = spec("MysteryPath-v0", summary, MOVE);
+    let grid = spec("MysteryPath-Grid-v0", "Mystery Path with turning and walking from tile to tile", TURN_AND_WALK);
+    let summary = "Follow an endless invisible path; a fall before the farthest column, or twice at the same tile, ends the episode";
+    let endless = spec("Endless-MysteryPath-v0", summary, FOLLOW);
+    let (info, features, metric) = (FINITE_INFO, FINITE_FEATURES, Metric::TASK_PROGRESS);
+    [
+        (EnvSpec { info, features, metric, parameters: MYSTERY_PATH, ..free }, Variant::Free),
+        (EnvSpec { info, features, metric, parameters: MYSTERY_PATH_GRID, render_fps: 3, ..grid }, Variant::Grid),
+        (
+            EnvSpec {
+                ground_truth: GROUND_TRUTH,
+                ground_truth_is_integer: true,
+                info: ENDLESS_INFO,
+                features: ENDLESS_FEATURES,
+                parameters: ENDLESS_MYSTERY_PATH,
+                metric: Metric { name: "tiles_visited", label: "Tiles" },
+                learnt: None,
+                ..endless
+            },
+            Variant::Endless,
+        ),
+    ]
+});

@@ -231,38 +231,6 @@ fn features_and_frame_show_the_same_past_path() {
     }
 }
 
-#[test]
-fn a_restored_state_continues_identically() {
-    for number in 0..IDS.len() {
-        let mut game = Game::new(number, &json!({}), 9);
-        let branches = game.spec.action_space.branches();
-        let action = |step: i32| branches.iter().map(|n| step * 7 / 3 % n).collect::<Vec<i32>>();
-        for step in 0..50 {
-            game.step(&action(step));
-        }
-        let saved = serde_json::to_string(game.state()).unwrap();
-        let state: State = serde_json::from_str(&saved).unwrap();
-        assert_eq!(&state, game.state());
-        let env = MysteryPath { assets: Arc::clone(&game.env.assets), state };
-        let mut restored = Game { spec: game.spec, env, random: game.random.clone() };
-        for step in 0..50 {
-            assert_eq!(restored.step(&action(step)), game.step(&action(step)));
-            assert_eq!(restored.frame(), game.frame());
-        }
-    }
-}
-
-#[test]
-fn column_names_are_unique() {
-    for (spec, _) in IDS {
-        let mut names: Vec<&str> = spec.features.iter().map(|column| column.name).collect();
-        assert!(names.iter().all(|name| !name.is_empty()));
-        names.sort_unstable();
-        names.dedup();
-        assert_eq!(names.len(), spec.features.len(), "{}", spec.id);
-    }
-}
-
 proptest! {
     /// No allowed reset parameters cause a panic, and the episodes stay small.
     #[test]

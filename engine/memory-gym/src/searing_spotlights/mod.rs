@@ -51,10 +51,8 @@ pub use registry::IDS;
 pub use scene::Scene;
 pub use state::State;
 
-use endless_gym_core::envs::Expert;
-use endless_gym_core::envs::Progress;
-use endless_gym_core::envs::ResetParameters;
-use endless_gym_core::envs::{Environment, InvalidState, Transition};
+use crate::shared_methods::shared_methods;
+use endless_gym_core::envs::{Environment, Expert, InvalidState};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 
@@ -66,14 +64,7 @@ pub struct SearingSpotlights {
 }
 
 impl Environment for SearingSpotlights {
-    type Variant = Variant;
-    type Assets = Assets;
-    type State = State;
-    type Scene = Scene;
-
-    fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
-        Assets::new(variant, Parameters::new(variant, parameters))
-    }
+    shared_methods!();
 
     fn new(assets: &Arc<Assets>) -> Self {
         SearingSpotlights { assets: Arc::clone(assets), state: State::new() }
@@ -86,20 +77,8 @@ impl Environment for SearingSpotlights {
         self.state.reset(&assets.config, random);
     }
 
-    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
-        self.state.step(&self.assets.config, action, random)
-    }
-
-    fn shared(&self) -> &Arc<Assets> {
-        &self.assets
-    }
-
     fn scene(&self) -> Scene {
         Scene::new(&self.state, &self.assets.config)
-    }
-
-    fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
-        scene.paint(assets, canvas);
     }
 
     fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
@@ -110,18 +89,10 @@ impl Environment for SearingSpotlights {
         self.assets.draw_ground_truth(&self.state, canvas);
     }
 
-    fn features(&self, out: &mut [f32]) {
-        self.state.write_features(&self.assets.config, out);
-    }
-
     fn ground_truth(&self, out: &mut [f64]) {
         if self.assets.config.variant.endless {
             out.copy_from_slice(&self.state.ground_truth());
         }
-    }
-
-    fn state(&self) -> &State {
-        &self.state
     }
 
     fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
@@ -131,10 +102,6 @@ impl Environment for SearingSpotlights {
         self.assets = Arc::clone(assets);
         self.state = state;
         Ok(())
-    }
-
-    fn progress(&self) -> Vec<Progress> {
-        self.state.progress(&self.assets.config)
     }
 
     fn info(&self, out: &mut [f64]) {

@@ -5,16 +5,10 @@
 
 use super::features::FEATURES;
 use super::parameters::{MAX_AGENT_SCALE, MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
-use crate::controls::MOVE;
-use crate::screen::spec;
-use endless_gym_core::envs::ActionSpace;
-use endless_gym_core::envs::Parameter;
-use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric};
+use std::sync::LazyLock;
 
-const fn max_steps(default: i64) -> Parameter {
-    const ANY: (i64, i64) = (i64::MIN, i64::MAX);
-    Parameter::int("max_steps", default, ANY.0, ANY.1, "Maximum steps per episode; unlimited if less than 1.")
-}
+use crate::controls::{MOVE, max_steps, spec};
+use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, Parameter};
 
 const fn initial_spawns(default: i64) -> Parameter {
     Parameter::int("initial_spawns", default, 0, MAX_SPOTLIGHTS as i64, "Spotlights at the start of an episode.")
@@ -236,41 +230,16 @@ const GROUND_TRUTH: &[Column] = &[
 ];
 
 /// The two ids of the family.
-pub const IDS: &[(EnvSpec, Variant)] = &[
-    (
-        {
-            let mut spec = spec(
-                "SearingSpotlights-v0",
-                "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
-                ActionSpace::multi_discrete(&[3, 3]),
-                MOVE,
-            );
-            spec.info = FINITE_INFO;
-            spec.features = FEATURES;
-            spec.keeps_state = true;
-            spec.parameters = SEARING_SPOTLIGHTS;
-            spec.metric = Metric::TASK_PROGRESS;
-            spec
-        },
-        Variant { endless: false },
-    ),
-    (
-        {
-            let mut spec = spec(
-                "Endless-SearingSpotlights-v0",
-                "Collect one coin after the other in the dark, without being hit by moving spotlights",
-                ActionSpace::multi_discrete(&[3, 3]),
-                MOVE,
-            );
-            spec.ground_truth = GROUND_TRUTH;
-            spec.info = ENDLESS_INFO;
-            spec.features = FEATURES;
-            spec.keeps_state = true;
-            spec.parameters = ENDLESS_SEARING_SPOTLIGHTS;
-            spec.metric = Metric { name: "coins_collected", label: "Coins" };
-            spec.learnt = None;
-            spec
-        },
-        Variant { endless: true },
-    ),
-];
+pub static IDS: LazyLock<[(EnvSpec, Variant); 2]> = LazyLock::new(|| {
+    let summary = "Collect coins and leave by the exit in the dark, without being hit by moving spotlights";
+    let finite = spec("SearingSpotlights-v0", summary, MOVE);
+    let summary = "Collect one coin after the other in the dark, without being hit by moving spotlights";
+    let endless = spec("Endless-SearingSpotlights-v0", summary, MOVE);
+    let (features, keeps_state, ground_truth) = (FEATURES, true, GROUND_TRUTH);
+    let (info, parameters, metric) = (FINITE_INFO, SEARING_SPOTLIGHTS, Metric::TASK_PROGRESS);
+    let finite = EnvSpec { info, features, keeps_state, parameters, metric, ..finite };
+    let (info, parameters) = (ENDLESS_INFO, ENDLESS_SEARING_SPOTLIGHTS);
+    let metric = Metric { name: "coins_collected", label: "Coins" };
+    let endless = EnvSpec { ground_truth, info, features, keeps_state, parameters, metric, learnt: None, ..endless };
+    [(finite, Variant { endless: false }), (endless, Variant { endless: true })]
+});
