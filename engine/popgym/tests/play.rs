@@ -1,96 +1,26 @@
-//! Tests of all ids in pools: experts, snapshots and threads. `tests/fuzz` forges snapshots.
+//! Tests of the experts of all ids. The checks of `conformance` and `tests/fuzz` play all ids, too.
 
-use endless_gym_core::batch::{Batch, Block, zeroed};
-use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::pool::{Autoreset, Experts, Pool, PoolConfig, ResetRequest, Seeding, Threads};
-use endless_gym_core::random::Generator;
+use endless_gym_core::batch::{Batch, zeroed};
+use endless_gym_core::pool::{Autoreset, Experts, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym_popgym::popgym;
-
-struct Player {
-    pool: Pool,
-    blocks: Vec<Block>,
-}
-
-impl Player {
-    /// Environments whose first episodes have seeds from `seed` on.
-    fn new(id: &str, num_envs: usize, threads: usize, seed: u64) -> Self {
-        let seeding = Seeding::Continue { seed: Some(1) };
-        let config = PoolConfig::new(id, num_envs).features(true).frames(None).seeding(seeding);
-        let pool = Pool::new(popgym(), &config, &Threads::new(threads).unwrap()).unwrap();
-        let blocks = zeroed(pool.layout().blocks());
-        let mut player = Player { pool, blocks };
-        player.pool.reset(ResetRequest::Seed(seed), &mut player.blocks).unwrap();
-        player
-    }
-
-    fn step(&mut self, actions: &[i32]) {
-        self.pool.step(actions, &mut self.blocks).unwrap();
-    }
-
-    fn batch(&self) -> Batch<'_> {
-        Batch::new(self.pool.layout(), &self.blocks)
-    }
-}
-
-fn actions(spec: &EnvSpec, num_envs: usize, random: &mut Generator) -> Vec<i32> {
-    (0..num_envs).flat_map(|_| spec.action_space.sample(random)).collect()
-}
-
-#[test]
-fn a_snapshot_continues_identically_and_threads_change_nothing() {
-    const ENVS: usize = 64;
-    for spec in popgym().specs() {
-        let mut random = Generator::from_seed(3);
-        let (mut one, mut two) = (Player::new(spec.id, ENVS, 1, 5), Player::new(spec.id, ENVS, 2, 5));
-        for step in 0..230 {
-            if step == 30 {
-                // Another pool, whose environments have played other episodes.
-                let mut restored = Player::new(spec.id, ENVS, 2, 900);
-                (0..7).for_each(|_| restored.step(&actions(spec, ENVS, &mut random)));
-                for env in 0..ENVS {
-                    restored.pool.restore(env, &one.pool.snapshot(env).unwrap()).unwrap();
-                }
-                two = restored;
-            }
-            let actions = actions(spec, ENVS, &mut random);
-            one.step(&actions);
-            two.step(&actions);
-            assert!(one.batch().bytes() == two.batch().bytes(), "{}, step {step}", spec.id);
-        }
-        assert!(one.batch().bytes() != Player::new(spec.id, ENVS, 1, 5).batch().bytes(), "{}", spec.id);
-    }
-}
-
-#[test]
-fn seeds_and_actions_determine_an_episode_whatever_was_played_before() {
-    for spec in popgym().specs() {
-        let (mut fresh, mut used) = (Player::new(spec.id, 4, 1, 5), Player::new(spec.id, 4, 1, 77));
-        let mut random = Generator::from_seed(4);
-        (0..150).for_each(|_| used.step(&actions(spec, 4, &mut random)));
-        used.pool.reset(ResetRequest::Seed(5), &mut used.blocks).unwrap();
-        for step in 0..300 {
-            assert!(fresh.batch().bytes() == used.batch().bytes(), "{}, step {step}", spec.id);
-            let actions = actions(spec, 4, &mut random);
-            fresh.step(&actions);
-            used.step(&actions);
-        }
-    }
-}
 
 /// The mean return of experts in so many episodes.
 fn expert_return(id: &str, episodes: usize) -> f64 {
-    let mut player = Player::new(id, episodes, 1, 0);
+    let config = PoolConfig::new(id, episodes).features(true).frames(None);
+    let mut pool = Pool::new(popgym(), &config, &Threads::new(1).unwrap()).unwrap();
+    let mut blocks = zeroed(pool.layout().blocks());
+    pool.reset(ResetRequest::Seed(0), &mut blocks).unwrap();
     let mut experts = Experts::new(popgym(), id, episodes, Autoreset::NextStep).unwrap();
     let mut actions = vec![0; episodes * popgym().spec(id).unwrap().action_space.width()];
     let (mut returns, mut played): (Vec<Option<f64>>, _) = (vec![None; episodes], 0);
     while returns.iter().any(Option::is_none) {
-        experts.act(&player.batch(), &mut actions).unwrap();
-        player.step(&actions);
+        experts.act(&Batch::new(pool.layout(), &blocks), &mut actions).unwrap();
+        pool.step(&actions, &mut blocks).unwrap();
         // No state of play is refused.
         let env = played % episodes;
-        player.pool.restore(env, &player.pool.snapshot(env).unwrap()).unwrap();
+        pool.restore(env, &pool.snapshot(env).unwrap()).unwrap();
         played += 1;
-        let batch = player.batch();
+        let batch = Batch::new(pool.layout(), &blocks);
         for (env, first) in returns.iter_mut().enumerate() {
             if batch.terminated()[env] + batch.truncated()[env] > 0 {
                 first.get_or_insert(batch.episode_return()[env]);
