@@ -100,8 +100,8 @@ class Job(Protocol):
     def folder(self) -> Path:
         """Folder that the job writes."""
 
-    def begin(self, machine: Machine) -> list[list[str]]:
-        """Prepare the folder, and return the commands that are left, each a program of this package and its arguments."""
+    def commands(self, machine: Machine) -> list[list[str]]:
+        """The commands that are left, each a program of this package and its arguments."""
 
     def has_succeeded(self) -> bool:
         """Whether a command that has ended with status 0 has done all of its work."""
@@ -241,7 +241,7 @@ class Runner:
             say: Called with each line of progress.
             progress: Returns a line with the progress of all jobs.
             ended: Called with each job that is done.
-            retries: How often jobs that fail, or are killed, are started again, all together.
+            retries: How often jobs that fail, or are killed, begin again, all together.
         """
         self.machine, self.file, self.say, self.progress, self.ended = machine, file, say, progress, ended
         self.retries = retries
@@ -288,7 +288,7 @@ class Runner:
         if lock is None:
             self.say(f"{job.title}: another process is running it")
             return False
-        commands = job.begin(self.machine)
+        commands = job.commands(self.machine)
         if not commands:
             lock.close()
             return False
@@ -305,34 +305,33 @@ class Runner:
         return self.machine.start(command, slot, lock, log)
 
     def _look(self, active: _Active) -> None:
-        """If a job's process has ended, start its next command or finish the job."""
+        """If a job's process has ended, start its next command, or the same again, or finish the job."""
         status, job = active.process.poll(), active.job
         if status is None:
             return
         is_done = status == 0 and job.has_succeeded()
-        left = len(active.commands) + (not is_done)
-        if is_done and active.commands and not self.stopped:
-            _list(self.file, {job.title: {"left": left}})
-            active.process = self._spawn(active.commands.pop(0), active.slot, active.lock, active.log)
+        following = active.commands
+        if not is_done and not self.stopped:
+            following = job.commands(self.machine) if self.retries else []
+            self.retries -= bool(following)
+            again = ", started again" if following else ""
+            self.say(f"{job.title}: failed with status {status}{again}; the log is {job.folder}.log")
+        if following and not self.stopped:
+            command, *active.commands = following
+            _list(self.file, {job.title: {"left": len(following)}})
+            active.process = self._spawn(command, active.slot, active.lock, active.log)
             return
         self._active.remove(active)
-        if job in self.failed:
-            self.failed.remove(job)
-        if not left:
-            state = "done"
+        left = len(active.commands) + (not is_done)
+        state = "stopped" if left and self.stopped else "failed" if left else "done"
+        _list(self.file, {job.title: {"state": state, "left": left}})
+        if state == "done":
             self.ended(job)
             self.say(f"{job.title}: done after {(time.monotonic() - active.begun) / 60:.1f} minutes")
-        elif self.stopped:
-            state = "stopped"
+        elif state == "stopped":
             self.say(f"{job.title}: stopped {job.progress()}".rstrip())
         else:
-            state = "failed"
             self.failed.append(job)
-            self.say(f"{job.title}: failed with status {status}; the log is {job.folder}.log")
-            if self.retries:
-                self.retries -= 1
-                self._waiting.append(job)
-        _list(self.file, {job.title: {"state": state, "left": left}})
         active.log.close()
         active.lock.close()
 

@@ -11,6 +11,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -158,6 +159,7 @@ class _Host:
             return self._process.wait()
 
     def send_signal(self, number: int) -> None:
-        """Send a signal to the command, unless it has ended."""
-        if self._process is not None:
-            self._process.send_signal(number)
+        """Send a signal to the command as soon as it has started, unless it has ended."""
+        while self._process is None:
+            time.sleep(0.01)
+        self._process.send_signal(number)

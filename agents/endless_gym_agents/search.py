@@ -60,7 +60,7 @@ class Worker(jobs.Job):
         """What the names of its log and its lock begin with."""
         return self.trials.folder / f"worker-{self.number}"
 
-    def begin(self, machine: jobs.Machine) -> list[list[str]]:
+    def commands(self, machine: jobs.Machine) -> list[list[str]]:
         """The search with these arguments in one process, for the rest of the time; nothing if the time is up."""
         left, settings = self.trials.end - time.monotonic(), self.trials.arguments.settings
         if left <= 0:
@@ -132,7 +132,7 @@ def run_workers(trials: Trials, given: list[str]) -> None:
 
     def progress() -> str:
         done, left = trials.remaining()
-        return f"{done} trials done, {left} not begun"
+        return f"{done} trials done, {left} remaining"
 
     with connection as machine:
         runner = jobs.Runner(machine, trials.folder / jobs.LIST, trials.say, progress, retries=arguments.max_failures)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import fcntl
 import json
 import logging
-import shutil
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -22,7 +21,7 @@ import tyro
 from rich.console import Console
 
 from endless_gym_agents import atomic, checkpoint, command, jobs, ranges, tables
-from endless_gym_agents.logs import read_progress
+from endless_gym_agents.logs import PROGRESS, read_progress
 from endless_gym_agents.ranges import FromZero, Natural, Positive, Range
 from endless_gym_agents.search_space import STUDY, Choice, Space, single_changes, space, with_choices
 from endless_gym_agents.settings import Settings, to_dict
@@ -371,21 +370,11 @@ class Trials:
 
 
 def resumable(settings: Settings) -> tuple[Settings, list[dict[str, Any]]]:
-    """The settings with which a trial's run is resumed or started.
-
-    Args:
-        settings: Settings of the run, with its folder. The folder is removed if the run was interrupted before its first
-            checkpoint.
-
-    Returns:
-        The settings, and the rows of `progress.jsonl` so far.
-    """
+    """The settings with which a trial's run, in its folder, is resumed or started, and the rows of `progress.jsonl` so far."""
     run = Path(settings.run)
-    if (run / checkpoint.FOLDER / checkpoint.LAST).exists():
-        return replace(settings, resume=settings.run), read_progress(run)
-    if run.exists():
-        shutil.rmtree(run)
-    return settings, []
+    if (run / checkpoint.SETTINGS).exists():
+        settings = replace(settings, resume=settings.run)
+    return settings, read_progress(run) if (run / PROGRESS).exists() else []
 
 
 def _pruner(arguments: SearchArguments) -> Any:

@@ -52,7 +52,7 @@ class Training:
     flags: str = "--ppo.updates 100000"
     title: str = "training"
 
-    def begin(self, machine: jobs.Machine) -> list[list[str]]:
+    def commands(self, machine: jobs.Machine) -> list[list[str]]:
         return [["endless-train", *SMALL.split(), "--run", str(self.folder), *self.flags.split()]]
 
     def has_succeeded(self) -> bool:
@@ -312,8 +312,8 @@ def test_a_job_that_fails_is_started_again_a_number_of_times(tmp_path: Path) -> 
     made = runner(tmp_path, said, jobs.Machine(1), retries=2)
     made.run([job])
     assert made.failed == [job]
-    failed = f"training: failed with status 1; the log is {tmp_path / 'a'}.log"
-    assert said == ["training: started", failed] * 3
+    failed, log = "training: failed with status 1", f"; the log is {tmp_path / 'a'}.log"
+    assert said == ["training: started", *2 * [f"{failed}, started again{log}"], f"{failed}{log}"]
     assert (tmp_path / "a.log").read_text().count("nonsense") >= 3
 
 

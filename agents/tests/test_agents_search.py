@@ -134,8 +134,7 @@ def test_no_trial_is_begun_after_the_time_limit(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("with_checkpoint", [True, False])
-def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_trial_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search that is interrupted after the first update has the same results as an uninterrupted search."""
     through = Trials(small(tmp_path / "through", stage="single"), QUIET)
     search.run_trials(through)
@@ -148,8 +147,6 @@ def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkey
     with pytest.raises(KeyboardInterrupt):
         search.run_trials(broken)
     assert states(broken) == ["RUNNING", "WAITING", "WAITING"]
-    if not with_checkpoint:
-        (tmp_path / "broken" / "trial-0000" / "checkpoints" / "last.pt").unlink()
     monkeypatch.setattr(search, "train", train)
     resumed = Trials(small(tmp_path / "broken", stage="single"), QUIET)
     search.run_trials(resumed)
@@ -194,14 +191,14 @@ def test_a_new_worker_has_the_rest_of_the_time(tmp_path: Path) -> None:
     trials = Trials(replace(given, settings=replace(given.settings, threads=3)), QUIET)
     worker = search.Worker(trials, ("--workers", "2", "--minutes", "5"), 0)
     trials.end -= 60
-    (command,) = worker.begin(jobs.Machine(2, job_cores=7))
+    (command,) = worker.commands(jobs.Machine(2, job_cores=7))
     parsed = parse(command[1:])
     assert 3.9 < parsed.minutes < 4
     assert (parsed.workers, parsed.folder, parsed.ray) == (0, str(tmp_path), "")
     # The threads of the machine, where the settings choose none.
     assert (parsed.settings.threads, parsed.settings.environment.num_threads) == (0, 7)
     trials.end = time.monotonic()
-    assert worker.begin(jobs.Machine(2)) == []
+    assert worker.commands(jobs.Machine(2)) == []
 
 
 def test_a_part_of_a_line_in_the_journal_is_cut_off(tmp_path: Path) -> None:

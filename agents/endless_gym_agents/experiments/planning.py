@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import shutil
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -69,13 +68,6 @@ class Job:
         begun = (checkpoint.last(self.folder), self.folder / STUDY)
         return "interrupted" if any(file.exists() for file in begun) else "not started"
 
-    def begin(self, machine: jobs.Machine) -> list[list[str]]:
-        """Prepare the folder, and return the commands that are left."""
-        if self.updates and not checkpoint.last(self.folder).exists() and (self.folder / checkpoint.SETTINGS).exists():
-            shutil.rmtree(self.folder)  # The run was killed before its first checkpoint.
-        self.folder.mkdir(exist_ok=True)
-        return self.commands(machine)
-
     def has_succeeded(self) -> bool:
         """Whether all updates are done; `endless-train` also ends with status 0 if it was interrupted."""
         return self.updates_done() >= self.updates
@@ -99,7 +91,7 @@ class Job:
             search = ["--folder", folder, "--trials", str(given.trials), "--warm-up", str(given.warm_up)]
             search += ["--parameters", *given.parameters] if given.parameters else []
             wanted = [["endless-search", *search, *own, *train]]
-        elif checkpoint.last(self.folder).exists():
+        elif (self.folder / checkpoint.SETTINGS).exists():
             wanted = [["endless-train", "--resume", folder, *train]]
         else:
             wanted = [["endless-train", *own, "--run", folder, *train]]
@@ -110,10 +102,12 @@ class Job:
             test = ["--seeds", str(protocol.seeds), "--repetitions", str(protocol.repetitions), *here]
             test += ["--engine-threads", str(machine.engine_threads), "--json", str(self.folder / EVALUATION)]
             wanted.append(["endless-eval", folder, *test])
-        result = {"curves": EVALUATION, "simulation-speed": SPEED, "search": STUDY}.get(experiment.kind, PROGRESS)
+        if not self.folder.exists():
+            return wanted
         left = jobs.listed(self.out / jobs.LIST).get(self.title, {}).get("left", len(wanted))
-        # The folder, or the result of the last command, may have been removed.
-        left = max(left, not (self.folder / result).exists()) if self.folder.exists() else len(wanted)
+        result = {"curves": EVALUATION, "simulation-speed": SPEED}.get(experiment.kind)
+        if result:  # It is written as a whole, at the end.
+            left = 0 if (self.folder / result).exists() else max(left, 1)
         return wanted[len(wanted) - left :]
 
 

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,7 @@ def main() -> int:
         rates = measure(given.env, given.episodes)
         result = {"mean": float(np.mean(rates)), "std": float(np.std(rates)), "episodes": len(rates)}
         result["load_average"] = os.getloadavg()[0]
+        Path(given.json).parent.mkdir(parents=True, exist_ok=True)
         atomic.write(given.json, json.dumps(result) + "\n")
 
     return command.run("endless-speed", execute)
