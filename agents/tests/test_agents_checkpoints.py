@@ -2,13 +2,11 @@
 
 import contextlib
 import dataclasses
-import itertools
 import json
 import os
 import re
 import resource
 import shutil
-import signal
 import sys
 import time
 import zipfile
@@ -206,29 +204,6 @@ def test_a_full_disk_leaves_the_former_checkpoint(file: Path, tmp_path: Path) ->
         with forked(lambda limit=limit: save(limit)) as process:  # type: ignore[misc]
             assert os.waitpid(process, 0)[1] == 0
         assert {each.name: each.read_bytes() for each in (run / "checkpoints").iterdir()} == {"last.pt": former}
-
-
-def test_a_kill_while_saving_leaves_a_whole_checkpoint(file: Path, tmp_path: Path) -> None:
-    run, state = tmp_path / "run", torch.load(file, weights_only=True)
-    # Has one byte for each save. A number that is written anew could be lost if the kill comes after the file was emptied.
-    saved = run / "saved"
-
-    def save() -> None:
-        for number in itertools.count():
-            checkpoint.save(run, state | {"steps": number}, False)
-            with saved.open("ab") as counter:
-                counter.write(b".")
-
-    for pause in (0, 0.001, 0.003, 0.01):
-        saved.unlink(missing_ok=True)
-        with forked(save) as process:
-            while not saved.exists():
-                time.sleep(0.001)
-            time.sleep(pause)
-            os.kill(process, signal.SIGKILL)
-            os.waitpid(process, 0)
-        last = saved.stat().st_size - 1
-        assert checkpoint.load(run).steps in (last, last + 1)
 
 
 def test_deep_settings_are_refused(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import json
 import os
 import pty
-import random
 import select
 import shutil
 import signal
@@ -92,48 +91,6 @@ def test_a_signal_stops_a_run_after_its_update_with_a_checkpoint(number: signal.
         assert 1 < len(rows) < 100_000
         assert checkpoint.load(run).update == rows[-1]["update"] == len(rows)
     assert [signal.getsignal(each) for each in STOP_SIGNALS] == before
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", STOP_SIGNALS)
-def test_a_process_killed_at_random_moments_loses_at_most_one_update(number: signal.Signals, tmp_path: Path) -> None:
-    """One run is killed and resumed several times, while it starts or trains, and then equals an undisturbed one.
-
-    `ENDLESS_KILLS` is the number of times.
-    """
-    run, known, moments = tmp_path / "run", 0, random.Random(number)
-    program = [sys.executable, "-m", "endless_gym_agents.train"]
-    flags = "--env MortarMayhem-Grid-v0 --preset quick --threads 1 --environment.num-envs 4 --ppo.steps 16"
-    flags += " --ppo.minibatches 2 --recurrence.hidden-size 16 --ppo.updates 100000 --no-stop-when-learnt"
-    # Programs that a shell has started in the background ignore SIGINT, and so do their children.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    for kill in range(int(os.environ.get("ENDLESS_KILLS", "3"))):
-        arguments = f"--resume {run}" if (run / "settings.json").exists() else f"{flags} --run {run}"
-        with subprocess.Popen(
-            [*program, *arguments.split()], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-        ) as process:
-            assert process.stdout is not None
-            # One in three dies at any moment from its start, the others while they train.
-            trains = kill % 3 < 2 and bool(process.stdout.readline() and process.stdout.readline())
-            moment = moments.uniform(0, 1.0 if trains else 4.0)
-            time.sleep(moment)
-            process.send_signal(number)
-            process.communicate(timeout=60)
-            status = process.returncode
-        done = len(read_progress(run)) if (run / "progress.jsonl").exists() else 0
-        saved = checkpoint.load(run).update if (run / "checkpoints" / "last.pt").exists() else 0
-        shown = (
-            f"kill {kill}, {moment:.3f} s after its {'second line' if trains else 'start'}: {saved} of {done} updates"
-        )
-        assert done - 1 <= saved, shown
-        assert known <= saved, f"{shown}, {known} before"
-        assert status == 0 or not trains, f"{shown}, status {status}"
-        known = saved
-    signal.signal(signal.SIGINT, before)
-    assert known > 0
-    given = parse([*flags.split(), "--run", str(tmp_path / "whole"), "--ppo.updates", str(known)])
-    whole = checkpoint.load(train(given)).agent.state_dict()
-    assert all(torch.equal(part, whole[name]) for name, part in checkpoint.load(run).agent.state_dict().items())
 
 
 @pytest.mark.timeout(600)
