@@ -106,16 +106,6 @@ def test_resumed_run_equals_an_uninterrupted_run(
         assert same(one[part], two[part]), part
 
 
-def test_log_rows_after_the_checkpoint_are_replaced(tmp_path: Path) -> None:
-    """A run that was killed between two checkpoints resumes from the last one."""
-    run = train(small("gru", tmp_path / "run", 2))
-    expected = progress(train(small("gru", tmp_path / "through", 4)))
-    with (run / "progress.jsonl").open("a") as file:
-        file.write(json.dumps({"update": 3, "loss": 1.0}) + '\n{"update": 4, "lo')
-    train(replace(small("gru", tmp_path, 4), resume=str(run)))
-    assert progress(run) == expected
-
-
 def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
     given = ({}, {"num_threads": 3}, {"engine": "process"})
     one, *others = (train(small("gru", tmp_path / str(n), 3, **changes)) for n, changes in enumerate(given))
