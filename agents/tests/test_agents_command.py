@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from endless_gym_agents import command, enjoy, plot, record, reproduce, search, train
+from endless_gym_agents import command, enjoy, plot, reproduce, search, train
 
 
 def of(arguments: type, *first: str) -> Callable[[list[str]], Any]:
@@ -20,7 +20,6 @@ def of(arguments: type, *first: str) -> Callable[[list[str]], Any]:
         (search.parse, "--environment.option", ("show_goal=true", "a=1"), ("show_goal=true", "a=1")),
         (search.parse, "--parameters", ("ppo.gamma", "ppo.epochs"), ("ppo.gamma", "ppo.epochs")),
         (of(enjoy.EnjoyArguments, "run"), "--seeds", ("3", "4"), (3, 4)),
-        (of(record.RecordArguments, "run"), "--error-rates", ("0", "0.5"), (0.0, 0.5)),
         (of(plot.PlotArguments), "--published", ("gru", "trxl"), ("gru", "trxl")),
         (of(plot.PlotArguments), "--env", ("A", "B"), ("A", "B")),
         (of(reproduce.ReproduceArguments), "--seeds", ("1", "2"), (1, 2)),
