@@ -25,7 +25,13 @@ pub fn files(namespace: &Namespace) -> Vec<PathBuf> {
     found
 }
 
-fn below(folder: &Path, found: &mut Vec<PathBuf>) {
+/// Where a round's runs of `endless learn` have their files.
+pub fn run(namespace: &Namespace) -> PathBuf {
+    namespace.root().with_extension("run")
+}
+
+/// Finds the files in a folder and its subfolders.
+pub fn below(folder: &Path, found: &mut Vec<PathBuf>) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         match entry.file_type() {
             Ok(kind) if kind.is_dir() => below(&entry.path(), found),
@@ -85,5 +91,7 @@ pub fn remove_all(namespace: &Namespace) {
     for path in files(namespace) {
         let _ = fs::remove_file(path);
     }
-    let _ = fs::remove_dir_all(namespace.root());
+    for folder in [namespace.root(), &run(namespace)] {
+        let _ = fs::remove_dir_all(folder);
+    }
 }

@@ -96,6 +96,9 @@ impl Scene<'_> {
                 self.wait_for(intruder)?;
                 self.replace(Role::Trainer)?;
             }
+            Fault::KillLearner { has_checkpoint, moment, resumed } => {
+                self.kill_learner(has_checkpoint, moment, resumed)?;
+            }
         }
         Ok(now())
     }

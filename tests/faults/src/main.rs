@@ -1,12 +1,13 @@
 //! Fault injection with real processes: an engine, its trainer, observers and visitors are killed, stopped and starved
 //! in a sequence derived from a seed, and the trainer compares every byte that it receives with a pool in its own
-//! process.
+//! process. Runs of `endless learn` are killed and continued.
 
 mod actors;
 mod checker;
 mod cleanliness;
 mod event;
 mod faults;
+mod learner;
 mod ledger;
 mod options;
 mod others;

@@ -4,6 +4,7 @@
 use endless_gym_core::random::{Generator, SeedSequence};
 use serde::{Deserialize, Serialize};
 
+use crate::learner::MILLION;
 use crate::shape::Shape;
 
 /// One process of a round.
@@ -46,6 +47,9 @@ pub enum Fault {
     OtherContainer,
     /// Another user's process tries to list engines, to connect, and to remove files.
     OtherUser,
+    /// A run of `endless learn` is killed before or after its first checkpoint, and so, at the moment `resumed`, is the
+    /// process that continues it. Moments are in millionths of the time that an undisturbed run takes.
+    KillLearner { has_checkpoint: bool, moment: u64, resumed: Option<u64> },
 }
 
 /// A permission that a fault or a round needs from the machine.
@@ -74,6 +78,15 @@ impl Fault {
             Fault::HoardingObserver => return "hoarding observer".to_owned(),
             Fault::OtherContainer => return "container with its own root".to_owned(),
             Fault::OtherUser => return "other user".to_owned(),
+            Fault::KillLearner { has_checkpoint, resumed, .. } => {
+                let what = match (resumed, has_checkpoint) {
+                    (None, false) => "starts",
+                    (None, true) => "learns",
+                    (Some(_), false) => "starts again",
+                    (Some(_), true) => "resumes",
+                };
+                return format!("learner killed while it {what}");
+            }
         };
         format!("{role:?} {what}").to_lowercase()
     }
@@ -151,7 +164,7 @@ fn fault(draws: &mut Generator, owns_memory: bool) -> Fault {
     if owns_memory && below(2) == 0 {
         return if below(4) == 0 { Fault::HoardingObserver } else { Fault::FillMemory { role, time } };
     }
-    match below(18) {
+    match below(22) {
         0..=2 => Fault::Kill { role, down },
         3..=4 => Fault::KillStarting { role, moment },
         5 => Fault::KillEnding { role, moment: moment / 4 },
@@ -164,6 +177,11 @@ fn fault(draws: &mut Generator, owns_memory: bool) -> Fault {
         14 => Fault::RemoveRoot { then: if below(2) == 0 { Role::Trainer } else { Role::Engine } },
         15 => Fault::HoardingObserver,
         16 => Fault::OtherContainer,
+        17..=20 => {
+            let has_checkpoint = below(2) == 0;
+            let resumed = (below(2) == 0).then(|| below(MILLION));
+            Fault::KillLearner { has_checkpoint, moment: below(MILLION), resumed }
+        }
         // A user namespace contains no other user.
         _ if owns_memory => Fault::Kill { role, down },
         _ => Fault::OtherUser,
@@ -187,6 +205,6 @@ mod tests {
     fn every_kind_of_fault_occurs() {
         let kinds: BTreeSet<_> =
             (0..400).flat_map(|round| Plan::new(1, round).steps).map(|step| step.fault.kind()).collect();
-        assert_eq!(kinds.len(), 27, "{kinds:?}");
+        assert_eq!(kinds.len(), 31, "{kinds:?}");
     }
 }
