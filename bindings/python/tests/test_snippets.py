@@ -168,7 +168,7 @@ SOURCES = (
     "*.md",
     "bindings/python/endless_gym/**/*.py",
     "bindings/python/examples/*.py",
-    "engine/cli/src/*.rs",
+    "engine/cli/src/**/*.rs",
     "docs/**/*.md",
 )
 #: A word with unquoted brackets, after a program or in an argument, which zsh would treat as a file name pattern.

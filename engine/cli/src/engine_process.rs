@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use endless_gym_service::{ConnectConfig, EngineConfig, ErrorKind, Namespace, ROOT_VARIABLE, Trainer};
 
-use super::failure::Failure;
+use crate::failure::Failure;
 
 /// Longest time that an engine may take to start.
 const START_TIMEOUT: Duration = Duration::from_secs(30);

@@ -1,35 +1,18 @@
 //! The command line program `endless`, as a library: the binary of the crate `endless-gym` and the Python package both run [`main`].
 
-mod bench;
-mod check;
-mod demo;
+mod commands;
 mod engine_process;
 mod failure;
 mod film;
-pub mod film_file;
-mod film_picture;
-mod film_webp;
-mod frames;
 mod huge_pages;
-mod learn;
-mod list;
 mod logs;
-mod new;
 mod open;
 mod options;
 mod output;
-mod page;
 mod picture;
-mod play;
-mod play_command;
-mod record;
-mod scaling;
-mod serve;
-mod status;
+mod policies;
 mod stop;
 mod terminal;
-mod verify;
-mod view;
 
 use std::ffi::OsString;
 
@@ -39,6 +22,11 @@ use endless_gym_service::Namespace;
 use endless_gym_trainer::settings::{self, Settings};
 use nix::sys::signal::{SigSet, Signal};
 
+pub use film::file as film_file;
+
+use commands::{
+    bench, check, demo, frames, learn, list, new, page, play, record, scaling, serve, status, verify, view,
+};
 use failure::Failure;
 
 /// Environments for reinforcement learning in lockstep, in process and in shared memory.
@@ -69,7 +57,7 @@ enum Command {
     /// Show the environments of a running engine in a browser on this machine or in the terminal.
     View(view::Args),
     /// Play an environment in a browser on this machine or in the terminal.
-    Play(play_command::Args),
+    Play(play::Args),
     /// Record episodes of scripted experts or random actions as a film or, with the Python package, a Minari data set.
     #[command(disable_help_flag = true)]
     Record(record::Args),
@@ -188,7 +176,7 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::Serve(args) => serve::run(registry, &args)?,
         Command::Status(args) => status::run(&args)?,
         Command::View(args) => view::run(&args)?,
-        Command::Play(args) => play_command::run(registry, &args)?,
+        Command::Play(args) => play::run(registry, &args)?,
         Command::Record(args) => record::run(registry, &args)?,
         Command::Bench(args) if args.compares_threads() => scaling::run(registry, &args)?,
         Command::Bench(args) => bench::run(registry, &args)?,

@@ -6,7 +6,7 @@ use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 
-use super::failure::Failure;
+use crate::failure::Failure;
 
 /// The environment variable that sets what to log.
 const VARIABLE: &str = "ENDLESS_GYM_LOG";

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::thread;
 
-use super::output::print_error;
+use crate::output::print_error;
 
 /// The environment variable that names the browser: commands separated by `:`, in which `%s` stands for the address.
 const BROWSER: &str = "BROWSER";

@@ -8,7 +8,7 @@ use endless_gym_core::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, See
 use endless_gym_core::raster::PixelFormat;
 use serde_json::{Map, Value as Json};
 
-use super::failure::Failure;
+use crate::failure::Failure;
 
 /// The value of `--autoreset` for a mode: the mode's name with hyphens.
 pub fn autoreset_value(mode: Autoreset) -> String {

@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use terminal_size::{Width, terminal_size_of};
 
-use super::failure::Failure;
+use crate::failure::Failure;
 
 /// Width in characters if standard output is not a terminal.
 const PIPE_WIDTH: u16 = 120;

@@ -7,10 +7,10 @@ use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::envs::view::Picture;
 use endless_gym_core::pool::{PoolConfig, Registry, Seeding};
 
-use super::failure::Failure;
-use super::film::Film;
-use super::play::Policy;
-use super::terminal::picture::Pixels;
+use crate::failure::Failure;
+use crate::film::Film;
+use crate::policies::Policy;
+use crate::terminal::picture::Pixels;
 
 /// When to print a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::{SigSet, Signal};
 
-use super::failure::Failure;
+use crate::failure::Failure;
 
 /// How often a child process checks whether its parent is running.
 const PARENT_INTERVAL: Duration = Duration::from_millis(200);

@@ -14,7 +14,6 @@ use endless_gym_page::ServerError;
 use endless_gym_page::server::Port;
 use endless_gym_service::{EngineStatus, GroupStatus, Namespace};
 
-
 /// Prometheus' text format.
 const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 

@@ -7,9 +7,9 @@ use endless_gym_core::pool::{
 };
 use endless_gym_core::raster::FrameShape;
 
-use super::super::failure::Failure;
 use super::frame::newest;
 use super::picture::Pixels;
+use crate::failure::Failure;
 
 /// An episode of a new environment, so that it depends only on its options, its seed and the actions.
 pub struct Game {

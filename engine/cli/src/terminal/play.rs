@@ -8,14 +8,14 @@ use ratatui::Frame;
 use ratatui::crossterm::event::Event;
 use ratatui::layout::Rect;
 
-use super::super::failure::Failure;
-use super::super::stop;
 use super::controls::Controls;
 use super::game::Game;
 use super::keys::{self, Command, Keys};
 use super::picture::fitting;
 use super::screen::{Screen, check};
 use super::status;
+use crate::failure::Failure;
+use crate::stop;
 
 /// Longest wait for a key between checks of the stop flag.
 const SLICE: Duration = Duration::from_millis(50);

@@ -16,8 +16,8 @@ use ratatui::{DefaultTerminal, Frame};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::time::Timespec;
 
-use super::super::failure::Failure;
-use super::super::stop;
+use crate::failure::Failure;
+use crate::stop;
 
 /// Time in which a command ends by itself after its terminal has gone away.
 const GRACE: Duration = Duration::from_secs(2);

@@ -14,14 +14,14 @@ use ratatui::Frame;
 use ratatui::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers};
 use ratatui::layout::Rect;
 
-use super::super::failure::Failure;
-use super::super::options::seconds;
-use super::super::output::{grouped, print};
-use super::super::stop;
 use super::frame::newest;
 use super::picture::{Pixels, fitting};
 use super::screen::{Screen, check};
 use super::status;
+use crate::failure::Failure;
+use crate::options::seconds;
+use crate::output::{grouped, print};
+use crate::stop;
 
 /// Time between two drawings of the screen.
 const INTERVAL: Duration = Duration::from_millis(100);

@@ -140,7 +140,8 @@ pub static IDS: LazyLock<[(EnvSpec, Variant); 5]> = LazyLock::new(|| {
         // The most commands, each shown and executed for the longest time.
         step_limit: |given| {
             let most = |name| given.int_list(name).into_iter().max().unwrap_or(0);
-            let (shown, burning) = (most("command_show_duration") + most("command_show_delay"), most("explosion_duration"));
+            let (shown, burning) =
+                (most("command_show_duration") + most("command_show_delay"), most("explosion_duration"));
             Some((shown + burning + most("explosion_delay")) * most("command_count") - burning + 1)
         },
         ..spec(id, summary, actions)

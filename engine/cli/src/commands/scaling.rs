@@ -5,9 +5,9 @@ use std::time::Duration;
 use endless_gym_core::pool::{Registry, Threads};
 use serde::Serialize;
 
-use super::bench::{Args, Round, in_process, through_service};
-use super::failure::Failure;
-use super::output::{fit, grouped, print, print_json, progress, table};
+use crate::commands::bench::{Args, Round, in_process, through_service};
+use crate::failure::Failure;
+use crate::output::{fit, grouped, print, print_json, progress, table};
 
 /// The measurements of one environment.
 #[derive(Serialize)]

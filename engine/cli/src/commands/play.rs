@@ -3,11 +3,13 @@
 use endless_gym_core::pool::{PoolConfig, Registry, ResetOptions};
 use endless_gym_page::PlayServer;
 
-use super::failure::Failure;
-use super::options::parameters;
-use super::output::print;
-use super::view::PageArgs;
-use super::{open, stop, terminal};
+use crate::commands::view::PageArgs;
+use crate::failure::Failure;
+use crate::open;
+use crate::options::parameters;
+use crate::output::print;
+use crate::stop;
+use crate::terminal;
 
 /// Arguments of `endless play`.
 ///

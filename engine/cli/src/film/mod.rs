@@ -1,11 +1,15 @@
 //! An episode that a policy plays, frame by frame.
 
+pub mod file;
+pub mod picture;
+pub mod webp;
+
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
 use endless_gym_core::envs::view::{Picture, rgb_array};
 use endless_gym_core::pool::{Experts, Pool, PoolConfig, PoolError, Registry, ResetRequest, Threads};
 
-use super::failure::Failure;
-use super::play::{Policy, RandomPolicy};
+use crate::failure::Failure;
+use crate::policies::{Policy, RandomPolicy};
 
 /// The policy that plays.
 enum Player {

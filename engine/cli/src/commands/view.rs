@@ -7,10 +7,11 @@ use std::thread::{self, JoinHandle};
 use endless_gym_service::Namespace;
 use endless_gym_view::ViewServer;
 
-use super::failure::Failure;
-use super::open::PrivatePage;
-use super::output::{print, print_error};
-use super::{stop, terminal};
+use crate::failure::Failure;
+use crate::open::PrivatePage;
+use crate::output::{print, print_error};
+use crate::stop;
+use crate::terminal;
 
 /// Arguments of `endless view`.
 ///

@@ -11,10 +11,10 @@ use endless_gym_service::{
 use endless_gym_view::RecentEpisodes;
 use serde_json::{Value as Json, json};
 
-use super::failure::Failure;
-use super::options::seconds;
-use super::output::{clear, fit, grouped, print, print_json, print_json_line, table};
-use super::stop;
+use crate::failure::Failure;
+use crate::options::seconds;
+use crate::output::{clear, fit, grouped, print, print_json, print_json_line, table};
+use crate::stop;
 
 /// Time between the two readings from which steps per second are computed, unless `--watch` sets it.
 const INTERVAL: Duration = Duration::from_millis(250);

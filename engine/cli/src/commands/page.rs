@@ -9,8 +9,8 @@ use endless_gym_core::files;
 use endless_gym_core::pool::Registry;
 use serde_json::Value as Json;
 
-use super::failure::Failure;
-use super::output::print;
+use crate::failure::Failure;
+use crate::output::print;
 
 const TARGET: &str = "wasm32-unknown-unknown";
 

@@ -3,9 +3,9 @@
 use endless_gym_core::pool::Registry;
 use std::io::{self, ErrorKind, Write};
 
-use super::failure::Failure;
-use super::film::Film;
-use super::options::EnvironmentArgs;
+use crate::failure::Failure;
+use crate::film::Film;
+use crate::options::EnvironmentArgs;
 
 /// Arguments of `endless frames`.
 #[derive(clap::Args)]

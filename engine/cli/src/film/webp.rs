@@ -4,7 +4,7 @@ use std::io::{Seek, SeekFrom, Write};
 
 use image_webp::{ColorType, WebPEncoder};
 
-use super::failure::Failure;
+use crate::failure::Failure;
 
 /// Bytes before the first chunk: `RIFF`, the length of what follows, `WEBP`.
 const HEADER: usize = 12;

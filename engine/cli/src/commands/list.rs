@@ -5,9 +5,9 @@ use endless_gym_core::envs::{ActionBranch, EnvSpec};
 use endless_gym_core::pool::Registry;
 use serde_json::json;
 
-use super::failure::Failure;
-use super::output::{self, print, print_coloured, print_json, table};
-use super::picture::{When, picture};
+use crate::failure::Failure;
+use crate::output::{self, print, print_coloured, print_json, table};
+use crate::picture::{When, picture};
 
 /// Arguments of `endless list`.
 #[derive(clap::Args)]

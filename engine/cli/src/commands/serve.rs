@@ -12,11 +12,11 @@ use endless_gym_service::{CheckpointConfig, Engine, EngineActivity, EngineConfig
 use endless_gym_view::MetricsServer;
 use serde::Deserialize;
 
-use super::engine_process::replace_by_cleanup;
-use super::failure::Failure;
-use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
-use super::output::{grouped, print, print_error};
-use super::stop::{self, Watchdog};
+use crate::engine_process::replace_by_cleanup;
+use crate::failure::Failure;
+use crate::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
+use crate::output::{grouped, print, print_error};
+use crate::stop::{self, Watchdog};
 
 /// How often the command checks whether the engine has ended.
 const CHECK_INTERVAL: Duration = Duration::from_millis(100);

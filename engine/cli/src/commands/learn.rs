@@ -7,9 +7,9 @@ use endless_gym_service::{ConnectConfig, EngineConfig, Trainer};
 use endless_gym_trainer::environments::{Environments, pool_config};
 use endless_gym_trainer::settings::{Place, Settings};
 
-use super::engine_process::EngineProcess;
-use super::failure::Failure;
-use super::stop;
+use crate::engine_process::EngineProcess;
+use crate::failure::Failure;
+use crate::stop;
 
 /// Longest wait for the engine of `--connect` to start.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);

@@ -3,8 +3,8 @@
 use clap::ValueEnum;
 use endless_gym_core::raster::FrameShape;
 
-use super::failure::Failure;
-use super::film::Film;
+use crate::failure::Failure;
+use crate::film::Film;
 
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

@@ -8,13 +8,13 @@ use endless_gym_core::pool::{Autoreset, Experts, Registry, ResetRequest};
 use endless_gym_service::EngineConfig;
 use serde_json::{Map, Value as Json, json};
 
-use super::engine_process::EngineProcess;
-use super::failure::Failure;
-use super::options::{self, EnvironmentArgs};
-use super::output::{grouped, print, print_json, progress, table};
-use super::play::{EpisodeStatistics, Policy, RandomPolicy};
-use super::stop;
-use super::view::Beside;
+use crate::commands::view::Beside;
+use crate::engine_process::EngineProcess;
+use crate::failure::Failure;
+use crate::options::{self, EnvironmentArgs};
+use crate::output::{grouped, print, print_json, progress, table};
+use crate::policies::{EpisodeStatistics, Policy, RandomPolicy};
+use crate::stop;
 
 /// Arguments of `endless demo`.
 #[derive(clap::Args)]

@@ -8,8 +8,8 @@ use endless_gym_core::trace::{Trace, replay};
 use rayon::prelude::*;
 use serde_json::json;
 
-use super::failure::Failure;
-use super::output::{print, print_json, progress};
+use crate::failure::Failure;
+use crate::output::{print, print_json, progress};
 
 /// Arguments of `endless verify`.
 #[derive(clap::Args)]

@@ -7,14 +7,14 @@ use std::sync::atomic::Ordering;
 use clap::Parser;
 use endless_gym_core::pool::{PoolConfig, PoolError, Registry, ResetOptions, Seeding};
 
-use super::failure::Failure;
-use super::film::Film;
-use super::film_file::{FilmFile, Shape};
-use super::film_picture::View;
-use super::options::parameters;
-use super::output::print;
-use super::play::Policy;
-use super::stop;
+use crate::failure::Failure;
+use crate::film::Film;
+use crate::film::file::{FilmFile, Shape};
+use crate::film::picture::View;
+use crate::options::parameters;
+use crate::output::print;
+use crate::policies::Policy;
+use crate::stop;
 
 /// Arguments of `endless record`: those of a film, or those of a data set, which the Python package parses.
 #[derive(clap::Args)]

@@ -10,16 +10,16 @@ use endless_gym_core::pool::{Pool, Registry, ResetRequest, StepTimes, Threads};
 use endless_gym_service::EngineConfig;
 use serde::Serialize;
 
-use super::engine_process::EngineProcess;
-use super::failure::Failure;
-use super::huge_pages;
-use super::options::{self, EnvironmentArgs};
-use super::output::{grouped, print, print_json, progress, table};
-use super::play::RandomPolicy;
-use super::stop;
+use crate::engine_process::EngineProcess;
+use crate::failure::Failure;
+use crate::huge_pages;
+use crate::options::{self, EnvironmentArgs};
+use crate::output::{grouped, print, print_json, progress, table};
+use crate::policies::RandomPolicy;
+use crate::stop;
 
 /// The Python script that measures the original.
-const ORIGINAL: &str = include_str!("original.py");
+const ORIGINAL: &str = include_str!("../../original.py");
 
 /// Longest time that an engine may take for one step.
 const STEP_TIMEOUT: Duration = Duration::from_secs(60);

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use endless_gym_core::pool::Registry;
 
-use super::failure::Failure;
-use super::output::print;
+use crate::failure::Failure;
+use crate::output::print;
 
 /// Arguments of `endless new`.
 #[derive(clap::Args)]
@@ -19,18 +19,18 @@ pub struct Args {
     path: Option<PathBuf>,
 }
 
-const TASK: &str = include_str!("../template/src/task.rs");
+const TASK: &str = include_str!("../../template/src/task.rs");
 
 /// The files of a crate named `t_maze`, with the id `TMaze-v0`. The manifest has another name in the template, since cargo leaves
 /// folders with a `Cargo.toml` out of a package.
 const TEMPLATE: [(&str, &str); 9] = [
-    ("Cargo.toml", include_str!("../template/manifest.toml")),
-    ("README.md", include_str!("../template/README.md")),
-    ("example.py", include_str!("../template/example.py")),
-    ("pyproject.toml", include_str!("../template/pyproject.toml")),
-    ("python/t_maze/__init__.py", include_str!("../template/python/t_maze/__init__.py")),
-    ("src/lib.rs", include_str!("../template/src/lib.rs")),
-    ("src/main.rs", include_str!("../template/src/main.rs")),
+    ("Cargo.toml", include_str!("../../template/manifest.toml")),
+    ("README.md", include_str!("../../template/README.md")),
+    ("example.py", include_str!("../../template/example.py")),
+    ("pyproject.toml", include_str!("../../template/pyproject.toml")),
+    ("python/t_maze/__init__.py", include_str!("../../template/python/t_maze/__init__.py")),
+    ("src/lib.rs", include_str!("../../template/src/lib.rs")),
+    ("src/main.rs", include_str!("../../template/src/main.rs")),
     ("src/task.rs", TASK),
     (".gitignore", "/target\n__pycache__\n*.so\n"),
 ];

@@ -5,9 +5,9 @@ use std::io::{BufWriter, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use super::failure::Failure;
-use super::film_picture::magnified;
-use super::film_webp::WebpFilm;
+use crate::failure::Failure;
+use crate::film::picture::magnified;
+use crate::film::webp::WebpFilm;
 
 /// The environment variable that names the program ffmpeg, the same as for the Python package imageio-ffmpeg.
 const FFMPEG: &str = "IMAGEIO_FFMPEG_EXE";

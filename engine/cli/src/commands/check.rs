@@ -6,8 +6,8 @@ use endless_gym_core::pool::Registry;
 use rayon::prelude::*;
 use serde_json::json;
 
-use super::failure::Failure;
-use super::output::{print, print_json, progress};
+use crate::failure::Failure;
+use crate::output::{print, print_json, progress};
 
 /// Arguments of `endless check`.
 #[derive(clap::Args)]
