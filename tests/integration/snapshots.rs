@@ -1,7 +1,6 @@
 //! What a snapshot contains, and broken ones. The checks of `conformance` play on from snapshots.
 
 use crate::support::player::Player;
-use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetOptions, ResetRequest, SNAPSHOT_VERSION, Seeding, SnapshotError};
 use serde_json::json;
 
