@@ -298,15 +298,15 @@ class Trials:
         """The next `optuna.Trial` with its lock; None if none is left. The caller must hold the lock of the folder."""
         import optuna
 
+        # A different seed for each trial: processes must not propose the same, and a restarted search must not repeat its
+        # earlier samples.
+        self.study.sampler = optuna.samplers.TPESampler(seed=self.arguments.settings.seed + len(self.study.trials))
         if not self._numbers("WAITING"):
             for trial in self.study.trials:
                 if trial.state.name == "RUNNING" and (lock := self._lock_of(trial.number)) is not None:
                     return optuna.trial.Trial(self.study, trial._trial_id), lock
         if not self._new():
             return None
-        # A different seed for each trial: processes must not propose the same, and a restarted search must not repeat its
-        # earlier samples.
-        self.study.sampler = optuna.samplers.TPESampler(seed=self.arguments.settings.seed + len(self.study.trials))
         asked = self.study.ask()
         lock = self._lock_of(asked.number)
         assert lock is not None, "no process but this one has the trial"

@@ -29,6 +29,8 @@ from endless_gym_agents.train import train
 
 #: Where jobs run, as flags.
 WHERE = pytest.mark.parametrize("where", [(), ("--ray",)], ids=["here", "ray"])
+#: Starts a program of the package.
+Program = Callable[..., contextlib.AbstractContextManager["subprocess.Popen[bytes]"]]
 #: A small run with a checkpoint after each update.
 SMALL = "--preset quick --env MortarMayhem-Grid-v0 --agent gru --environment.num-envs 4 --ppo.steps 16"
 SMALL += " --ppo.minibatches 1 --checkpoint-interval 1 --recurrence.hidden-size 16 --seed 1 --threads 1"
@@ -69,7 +71,7 @@ def runner(folder: Path, said: list[str], machine: jobs.Machine, retries: int = 
 @pytest.fixture
 def program(
     tmp_path: Path, where: Sequence[str], request: pytest.FixtureRequest, segments: Callable[[], set[str]]
-) -> Iterator[Callable[..., contextlib.AbstractContextManager["subprocess.Popen[bytes]"]]]:
+) -> Program:
     """Starts a program of the package in the folder, with its output in the file `output`.
 
     At the end of its block no process and no shared memory of it may be left; the path of Ray's interpreter has a space.
@@ -85,8 +87,7 @@ def program(
         found = []
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error):
-                line = " ".join(process.cmdline())
-                if str(tmp_path) in line or (ray_folder and ray_folder in line):
+                if process.cwd() == str(tmp_path) or (ray_folder and ray_folder in " ".join(process.cmdline())):
                     found.append(process)
         return found
 
@@ -113,7 +114,7 @@ def program(
             process.kill()
             process.wait()
 
-    yield started
+    return started
 
 
 def wait_for_updates(process: "subprocess.Popen[bytes]", count: int, *runs: Path) -> None:
@@ -140,7 +141,7 @@ def values(folder: Path) -> dict[int, tuple[str, float | None, dict[int, float]]
 @pytest.mark.slow
 @WHERE
 def test_workers_of_a_search_resume_only_the_trial_of_a_killed_one(
-    where: Sequence[str], tmp_path: Path, program: Callable[..., contextlib.AbstractContextManager]
+    where: Sequence[str], tmp_path: Path, program: Program
 ) -> None:
     """All trials end as in a search in one process."""
     given = [*SEARCH, "--ppo.updates", "20"]
@@ -176,7 +177,7 @@ def test_workers_stop_with_their_search(
     number: signal.Signals,
     where: Sequence[str],
     tmp_path: Path,
-    program: Callable[..., contextlib.AbstractContextManager],
+    program: Program,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Ctrl-C in a terminal signals all processes of the group. Even if the search is killed, its workers stop."""
@@ -225,7 +226,7 @@ def test_workers_stop_with_their_search(
 @pytest.mark.slow
 @WHERE
 def test_stopped_runs_of_an_experiment_equal_uninterrupted_ones(
-    where: Sequence[str], tmp_path: Path, program: Callable[..., contextlib.AbstractContextManager]
+    where: Sequence[str], tmp_path: Path, program: Program
 ) -> None:
     """A run that was killed, and then stopped by Ctrl-C, is completed; repeating the command then runs nothing."""
     (own,) = EXPERIMENT["runs"]
