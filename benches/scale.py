@@ -21,7 +21,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from endless_gym_agents.logs import read_progress
+from endless_gym_agents.training.logs import read_progress
 
 
 def start(ranks: int, folder: Path, cores: list[int], arguments: list[str]) -> subprocess.Popen[bytes]:

@@ -6,13 +6,16 @@ Run `python xtask/cycles.py`.
 import ast
 import re
 import sys
-import tomllib
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import tomllib
+
 #: The folders with code, each of which uses only itself and those before it, in Rust and in Python.
 FLOORS = ["engine", "src", "bindings", "agents"]
+#: The rooms of the agents, in the same order.
+ROOMS = ["common", "settings", "environments", "memories", "agent", "training", "evaluation", "paper"]
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
 CRATES = [
     "engine/kernels",
@@ -128,7 +131,9 @@ def python_imports(folder: Path) -> dict[Module, set[Module]]:
 
 def upward_imports() -> Iterator[str]:
     """Crates and Python files of a floor that depend on a crate or a package of a higher one."""
-    crates = {tomllib.loads(path.read_text())["package"]["name"]: floor for floor in FLOORS for path in manifests(floor)}
+    crates = {
+        tomllib.loads(path.read_text())["package"]["name"]: floor for floor in FLOORS for path in manifests(floor)
+    }
     packages = {Path(package).name: package.split("/")[0] for package in PACKAGES}
     for floor in FLOORS:
         above = FLOORS[FLOORS.index(floor) + 1 :]
@@ -143,13 +148,21 @@ def upward_imports() -> Iterator[str]:
                     yield from (f"{path}: {name}" for name in imported if packages.get(name) in above)
 
 
+def upward_rooms() -> Iterator[str]:
+    """Modules of the agents that import a room above their own."""
+    for module, imported in python_imports(Path("agents/endless_gym_agents")).items():
+        room = module[1] if len(module) > 1 else ""
+        above = ROOMS[ROOMS.index(room) + 1 :] if room in ROOMS else []
+        yield from (f"{'.'.join(module)}: {'.'.join(name)}" for name in imported if len(name) > 1 and name[1] in above)
+
+
 def manifests(floor: str) -> list[Path]:
     """The manifests of a floor's crates; that of `src` is the root's."""
-    return [Path("Cargo.toml")] if floor == "src" else [path for path in sorted(Path(floor).glob("*/Cargo.toml"))]
+    return [Path("Cargo.toml")] if floor == "src" else sorted(Path(floor).glob("*/Cargo.toml"))
 
 
 failed = False
-for upward in upward_imports():
+for upward in (*upward_imports(), *upward_rooms()):
     failed = True
     print(f"{upward} is of a higher folder")
 for folder, imports in [

@@ -20,11 +20,12 @@ from typing import Any
 import torch
 
 from endless_gym.program import program
-from endless_gym_agents import atomic, checkpoint
-from endless_gym_agents.curves import published
-from endless_gym_agents.evaluate import evaluate, mean
-from endless_gym_agents.logs import read_progress
-from endless_gym_agents.results import metric
+from endless_gym_agents.common import atomic
+from endless_gym_agents.evaluation.curves import published
+from endless_gym_agents.evaluation.evaluate import evaluate, mean
+from endless_gym_agents.evaluation.results import metric
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.logs import read_progress
 
 FOLDER = Path(__file__).parent / "hour"
 #: Flags of all runs: one thread, and 64 environments with rollouts of 128 steps, which are also the length of BPTT.

@@ -27,16 +27,19 @@ import numpy as np
 import torch
 
 from endless_gym import _native
-from endless_gym_agents import atomic, checkpoint, export, reproduce
-from endless_gym_agents.agent import Agent
-from endless_gym_agents.conformance import state_bytes
-from endless_gym_agents.evaluate import evaluate, mean
-from endless_gym_agents.experiments import definitions, planning
-from endless_gym_agents.experiments.planning import Job
-from endless_gym_agents.logs import read_progress
-from endless_gym_agents.ruler import TASKS, Task
+from endless_gym_agents.agent.agent import Agent
+from endless_gym_agents.common import atomic
+from endless_gym_agents.evaluation import export
+from endless_gym_agents.evaluation.conformance import state_bytes
+from endless_gym_agents.evaluation.evaluate import evaluate, mean
+from endless_gym_agents.evaluation.ruler import TASKS, Task
+from endless_gym_agents.evaluation.statistics import summarise
+from endless_gym_agents.paper import reproduce
+from endless_gym_agents.paper.experiments import definitions, planning
+from endless_gym_agents.paper.experiments.planning import Job
 from endless_gym_agents.settings import Environment
-from endless_gym_agents.statistics import summarise
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.logs import read_progress
 
 FOLDER = Path(__file__).parent / "leaderboard"
 #: Agents without memory have one size.

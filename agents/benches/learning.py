@@ -19,10 +19,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from endless_gym_agents import atomic, checkpoint
-from endless_gym_agents.evaluate import evaluate, mean
+from endless_gym_agents.common import atomic
+from endless_gym_agents.evaluation.evaluate import evaluate, mean
 from endless_gym_agents.settings import Settings
-from endless_gym_agents.train import parse, train
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.train import parse, train
 
 FOLDER = Path(__file__).parent / "learning"
 #: Flags, time limit in minutes, target reward, and the largest possible reward if it is known.

@@ -27,14 +27,15 @@ from typing import Any
 
 import torch
 
-from endless_gym_agents import atomic, losses
-from endless_gym_agents.agent import Agent
-from endless_gym_agents.encoders import FRAME
-from endless_gym_agents.logs import read_progress
-from endless_gym_agents.ppo import minibatch_loss
-from endless_gym_agents.rollout import Segment
+from endless_gym_agents.agent.agent import Agent
+from endless_gym_agents.agent.encoders import FRAME
+from endless_gym_agents.common import atomic
 from endless_gym_agents.settings import AGENTS, PPO, PRESETS, Model, Recurrence, Settings, Transformer
-from endless_gym_agents.train import choose_device, train
+from endless_gym_agents.training import losses
+from endless_gym_agents.training.logs import read_progress
+from endless_gym_agents.training.ppo import minibatch_loss
+from endless_gym_agents.training.rollout import Segment
+from endless_gym_agents.training.train import choose_device, train
 
 TOLERANCE = 1e-3
 ENV = "Endless-MortarMayhem-v0"

@@ -20,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from endless_gym_agents import atomic
+from endless_gym_agents.common import atomic
 
 
 def cpu_seconds(session: int) -> float:

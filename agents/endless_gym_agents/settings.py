@@ -17,9 +17,9 @@ from gymnasium.vector import VectorWrapper
 from torch import nn
 
 from endless_gym.specs import DEFAULT_ENV_ID, spec
-from endless_gym_agents import own, ranges
-from endless_gym_agents.own import MEMORIES
-from endless_gym_agents.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
+from endless_gym_agents.common import own, ranges
+from endless_gym_agents.common.own import MEMORIES
+from endless_gym_agents.common.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
 
 #: The agents of the package. Others are classes of your own; see `Settings.agent`.
 AGENTS = ("gru", "lstm", *MEMORIES, "trxl", "gtrxl", "none", "stack", "position")
@@ -199,13 +199,13 @@ class Settings:
     """gru, lstm, mingru, lru, mamba2, gated-deltanet, retnet, mlstm, ffm (Fast and Forgetful Memory), shm (Stable Hadamard
     Memory), trxl (Transformer-XL) or gtrxl (gated Transformer-XL); a baseline without memory: none, stack (stacked grey frames)
     or position (encoded step number as an observation); or a memory of your own: module:Class or file.py:Class, a class derived
-    from `endless_gym_agents.memories.sequence_model.SequenceModel`, or one as `endless_gym_agents.recurrent.CellMemory`
+    from `endless_gym_agents.memories.sequence_model.SequenceModel`, or one as `endless_gym_agents.memories.recurrent.CellMemory`
     describes"""
     agent_option: tuple[str, ...] = ()
     """arguments of the agent's class, each as NAME=VALUE with a JSON value; not for gru, lstm, trxl, gtrxl and the baselines"""
     encoder: str = ""
-    """encoder of your own: module:Class or file.py:Class, a class as `endless_gym_agents.encoders.OwnEncoder` describes; empty
-    for the paper's convolutional network"""
+    """encoder of your own: module:Class or file.py:Class, a class as `endless_gym_agents.agent.encoders.OwnEncoder` describes;
+    empty for the paper's convolutional network"""
     encoder_option: tuple[str, ...] = ()
     """arguments of the class of an encoder of your own, as for `agent-option`"""
     preset: PresetName = "paper"

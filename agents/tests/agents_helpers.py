@@ -9,13 +9,13 @@ from typing import Any
 import torch
 
 from endless_gym.specs import spec
-from endless_gym_agents import checkpoint, losses
-from endless_gym_agents.agent import Agent, AgentMemory, make_agent
-from endless_gym_agents.environments import Environments
-from endless_gym_agents.memory import MemoryState
-from endless_gym_agents.ppo import minibatch_loss
-from endless_gym_agents.rollout import RolloutCollector, Segment
+from endless_gym_agents.agent.agent import Agent, AgentMemory, make_agent
+from endless_gym_agents.environments.groups import Environments
+from endless_gym_agents.memories.memory import MemoryState
 from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer, to_dict
+from endless_gym_agents.training import checkpoint, losses
+from endless_gym_agents.training.ppo import minibatch_loss
+from endless_gym_agents.training.rollout import RolloutCollector, Segment
 
 #: An experiment of `endless-reproduce`: one run of six updates, with checkpoints every second.
 EXPERIMENT: dict[str, Any] = {"title": "Mine", "section": "-", "about": "A test.", "kind": "curves", "seeds": 1}

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch._dynamo  # noqa: F401
 from test_agents_training import progress, same, small
 
-from endless_gym_agents import checkpoint
-from endless_gym_agents.train import train
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.train import train
 
 
 def ended(work: Callable[[], object]) -> int:

@@ -15,10 +15,10 @@ from other_device import NAME, in_flight, locked
 from test_agents_training import ALL_HEADS, progress, small
 
 from endless_gym import EndlessVectorEnv, make_vec, serve
-from endless_gym_agents.clock import Clock
-from endless_gym_agents.recovery import RecoverableEngine
-from endless_gym_agents.train import train
-from endless_gym_agents.transfers import Upload
+from endless_gym_agents.common.clock import Clock
+from endless_gym_agents.environments.recovery import RecoverableEngine
+from endless_gym_agents.training.train import train
+from endless_gym_agents.training.transfers import Upload
 
 WHERE: dict[str, Callable[..., EndlessVectorEnv]] = {"thread": make_vec, "process": serve}
 ID = "Endless-MortarMayhem-v0"

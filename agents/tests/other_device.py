@@ -303,9 +303,9 @@ def device() -> Iterator[None]:
 
 
 def main() -> None:
-    from endless_gym_agents import checkpoint
-    from endless_gym_agents.evaluate import evaluate
-    from endless_gym_agents.train import parse, train
+    from endless_gym_agents.evaluation.evaluate import evaluate
+    from endless_gym_agents.training import checkpoint
+    from endless_gym_agents.training.train import parse, train
 
     register()
     folder = Path(sys.argv[1])

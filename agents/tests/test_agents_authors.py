@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from endless_gym_agents.memory import AnyMemory
-from endless_gym_agents.recurrent import RecurrentMemory, RecurrentMinibatch, RecurrentState
+from endless_gym_agents.memories.memory import AnyMemory
+from endless_gym_agents.memories.recurrent import RecurrentMemory, RecurrentMinibatch, RecurrentState
+from endless_gym_agents.memories.transformer import MASKED, Attention, TransformerMemory
 from endless_gym_agents.settings import Recurrence, Transformer
-from endless_gym_agents.transformer import MASKED, Attention, TransformerMemory
 
 RECORDED = json.loads(gzip.decompress((Path(__file__).parent / "authors.json.gz").read_bytes()))["cases"]
 CPU = torch.device("cpu")

@@ -20,9 +20,9 @@ import torch
 from agents_helpers import saved, settings
 
 from endless_gym.specs import spec
-from endless_gym_agents import checkpoint, train
-from endless_gym_agents.agent import make_agent
+from endless_gym_agents.agent.agent import make_agent
 from endless_gym_agents.settings import to_dict
+from endless_gym_agents.training import checkpoint, train
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,10 @@ from typing import Any
 
 import pytest
 
-from endless_gym_agents import command, enjoy, plot, reproduce, search, train
+from endless_gym_agents.common import command
+from endless_gym_agents.evaluation import enjoy, plot
+from endless_gym_agents.paper import reproduce, search
+from endless_gym_agents.training import train
 
 
 def of(arguments: type, *first: str) -> Callable[[list[str]], Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from endless_gym_agents import conformance
+from endless_gym_agents.evaluation import conformance
 from endless_gym_agents.memories import MEMORIES
 
 

@@ -18,13 +18,14 @@ import pytest
 import torch
 from agents_helpers import changed, settings
 
-from endless_gym_agents import checkpoint, enjoy, protocol
-from endless_gym_agents import train as training
-from endless_gym_agents.command import STOP_SIGNALS
-from endless_gym_agents.logs import MissingRow, read_progress
-from endless_gym_agents.run_folder import RunInUse
+from endless_gym_agents.common.command import STOP_SIGNALS
+from endless_gym_agents.evaluation import enjoy, protocol
 from endless_gym_agents.settings import Settings
-from endless_gym_agents.train import parse, train
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training import train as training
+from endless_gym_agents.training.logs import MissingRow, read_progress
+from endless_gym_agents.training.run_folder import RunInUse
+from endless_gym_agents.training.train import parse, train
 
 
 def small(agent: str, run: Path, **ppo: Any) -> Settings:

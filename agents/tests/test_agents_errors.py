@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from endless_gym_agents import enjoy, plot, probe, protocol, record, reproduce, search, train
+from endless_gym_agents.evaluation import enjoy, plot, probe, protocol, record
+from endless_gym_agents.paper import reproduce, search
+from endless_gym_agents.training import train
 
 GRID = "--env MortarMayhem-Grid-v0"
 NO_RAY = (

@@ -15,12 +15,14 @@ from rich.console import Console
 
 import endless_gym_agents
 from endless_gym.specs import spec
-from endless_gym_agents import checkpoint, protocol, tables
-from endless_gym_agents.agent import make_agent
-from endless_gym_agents.evaluate import evaluate
-from endless_gym_agents.protocol import EvalArguments, evaluate_runs, find
-from endless_gym_agents.results import Experiment, Experiments, Run, label, read, to_json
-from endless_gym_agents.train import parse, train
+from endless_gym_agents.agent.agent import make_agent
+from endless_gym_agents.common import tables
+from endless_gym_agents.evaluation import protocol
+from endless_gym_agents.evaluation.evaluate import evaluate
+from endless_gym_agents.evaluation.protocol import EvalArguments, evaluate_runs, find
+from endless_gym_agents.evaluation.results import Experiment, Experiments, Run, label, read, to_json
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.train import parse, train
 
 GRID = "MortarMayhem-Grid-v0"
 

@@ -14,9 +14,9 @@ import pytest
 import torch
 from agents_helpers import changed
 
-from endless_gym_agents.logs import read_progress
 from endless_gym_agents.settings import PRESETS
-from endless_gym_agents.train import train
+from endless_gym_agents.training.logs import read_progress
+from endless_gym_agents.training.train import train
 
 FILE = Path(__file__).parents[2] / "bindings" / "python" / "examples" / "ppo_gru.py"
 GRID, OPTION = "MortarMayhem-Grid-v0", "command_count=[1]"

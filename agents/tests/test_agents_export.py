@@ -18,7 +18,9 @@ from agents_helpers import changed, saved, settings
 from safetensors import safe_open
 from safetensors.torch import load_file
 
-from endless_gym_agents import atomic, checkpoint, enjoy, export, protocol
+from endless_gym_agents.common import atomic
+from endless_gym_agents.evaluation import enjoy, export, protocol
+from endless_gym_agents.training import checkpoint
 
 ID = "MortarMayhem-Grid-v0"
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,12 +20,13 @@ from agents_helpers import EXPERIMENT
 from rich.console import Console
 from test_agents_training import progress, same
 
-from endless_gym_agents import checkpoint, jobs, jobs_ray, search
-from endless_gym_agents.experiments import definitions, planning
-from endless_gym_agents.logs import read_progress
-from endless_gym_agents.search_study import Trials
+from endless_gym_agents.paper import jobs, jobs_ray, search
+from endless_gym_agents.paper.experiments import definitions, planning
+from endless_gym_agents.paper.search_study import Trials
 from endless_gym_agents.settings import Settings
-from endless_gym_agents.train import train
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.logs import read_progress
+from endless_gym_agents.training.train import train
 
 #: Where jobs run, as flags.
 WHERE = pytest.mark.parametrize("where", [(), ("--ray",)], ids=["here", "ray"])

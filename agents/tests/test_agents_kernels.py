@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym import _native
-from endless_gym_agents.kernels import KernelGRU, KernelMinGRU
-from endless_gym_agents.recurrence import packed_layers
+from endless_gym_agents.memories.kernels import KernelGRU, KernelMinGRU
+from endless_gym_agents.memories.recurrence import packed_layers
 
 
 def batches() -> list[tuple[int, list[int]]]:

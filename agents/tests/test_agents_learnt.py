@@ -10,8 +10,8 @@ from agents_helpers import settings
 import endless_gym
 from endless_gym import spec
 from endless_gym.specs import Learnt
-from endless_gym_agents.logs import learnt
-from endless_gym_agents.train import train
+from endless_gym_agents.training.logs import learnt
+from endless_gym_agents.training.train import train
 
 GRID = "MortarMayhem-Grid-v0"
 

@@ -8,13 +8,13 @@ import torch
 from agents_helpers import BRANCHES, ends, loss_of, make, observations, segment_of, settings
 from operations import Operations
 
-from endless_gym_agents import losses
-from endless_gym_agents.agent import Agent
-from endless_gym_agents.encoders import FRAME
-from endless_gym_agents.memory import MemoryState, Minibatch
-from endless_gym_agents.ppo import learn, linear_decay, minibatch_loss
-from endless_gym_agents.rollout import Segment
+from endless_gym_agents.agent.agent import Agent
+from endless_gym_agents.agent.encoders import FRAME
+from endless_gym_agents.memories.memory import MemoryState, Minibatch
 from endless_gym_agents.settings import PPO
+from endless_gym_agents.training import losses
+from endless_gym_agents.training.ppo import learn, linear_decay, minibatch_loss
+from endless_gym_agents.training.rollout import Segment
 
 GAMMA, LAMBDA = 0.9, 0.8
 

@@ -9,12 +9,14 @@ import pytest
 from agents_helpers import changed, settings
 
 from endless_gym import spec
-from endless_gym_agents import checkpoint, enjoy, export, plot, probe, protocol, search
-from endless_gym_agents import train as training
-from endless_gym_agents.agent import make_agent
-from endless_gym_agents.logs import read_progress
+from endless_gym_agents.agent.agent import make_agent
+from endless_gym_agents.evaluation import enjoy, export, plot, probe, protocol
 from endless_gym_agents.memories import MEMORIES
+from endless_gym_agents.paper import search
 from endless_gym_agents.settings import PRESETS, Settings
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training import train as training
+from endless_gym_agents.training.logs import read_progress
 
 ID = "MortarMayhem-Grid-v0"
 

@@ -7,13 +7,13 @@ import pytest
 import torch
 from agents_helpers import BRANCHES, ends, loss_of, make, observations, play, segment_of, settings, transformer
 
-from endless_gym_agents.agent import Agent, AgentMemory
-from endless_gym_agents.encoders import FRAME
-from endless_gym_agents.memory import balanced_split
-from endless_gym_agents.recurrent import RecurrentMemory, RecurrentMinibatch
-from endless_gym_agents.rollout import Segment
+from endless_gym_agents.agent.agent import Agent, AgentMemory
+from endless_gym_agents.agent.encoders import FRAME
+from endless_gym_agents.memories.memory import balanced_split
+from endless_gym_agents.memories.recurrent import RecurrentMemory, RecurrentMinibatch
+from endless_gym_agents.memories.transformer import Block, TransformerMemory
 from endless_gym_agents.settings import PRESETS, Recurrence
-from endless_gym_agents.transformer import Block, TransformerMemory
+from endless_gym_agents.training.rollout import Segment
 
 STEPS, ENVS = 24, 3
 
@@ -59,7 +59,7 @@ OTHERS = [name for name in TRANSFORMERS if name not in FAST]
 @pytest.fixture(autouse=True)
 def short_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Groups of single steps from several parts of a segment; with the short window, the last part is longer than the segment."""
-    monkeypatch.setattr("endless_gym_agents.transformer.SHORTEST_PART", 5)
+    monkeypatch.setattr("endless_gym_agents.memories.transformer.SHORTEST_PART", 5)
 
 
 def agent_of(name: str) -> Agent:

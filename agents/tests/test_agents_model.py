@@ -9,13 +9,13 @@ from agents_helpers import BRANCHES, changed, make, settings
 from operations import Products
 
 from endless_gym import make_vec, spec
-from endless_gym_agents import curves
-from endless_gym_agents.agent import Agent, make_agent
-from endless_gym_agents.encoders import FRAME, FRAMES_PER_CHUNK, AtariEncoder
-from endless_gym_agents.heads import PolicyHead, ReconstructionHead
+from endless_gym_agents.agent.agent import Agent, make_agent
+from endless_gym_agents.agent.encoders import FRAME, FRAMES_PER_CHUNK, AtariEncoder
+from endless_gym_agents.agent.heads import PolicyHead, ReconstructionHead
+from endless_gym_agents.evaluation import curves
+from endless_gym_agents.memories.transformer import Block, TransformerMemory
 from endless_gym_agents.settings import PRESETS, Recurrence, Transformer, from_dict, to_dict
-from endless_gym_agents.train import parse
-from endless_gym_agents.transformer import Block, TransformerMemory
+from endless_gym_agents.training.train import parse
 
 PAPER = PRESETS["paper"]
 

@@ -14,9 +14,9 @@ import torch
 from agents_helpers import changed, collecting, settings
 from operations import Operations
 
-from endless_gym_agents.clock import Clock
-from endless_gym_agents.ppo import learn, make_optimizer
+from endless_gym_agents.common.clock import Clock
 from endless_gym_agents.settings import Settings
+from endless_gym_agents.training.ppo import learn, make_optimizer
 
 STEPS, GROUPS = 16, 2
 

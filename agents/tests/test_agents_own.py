@@ -10,14 +10,15 @@ import pytest
 import torch
 from agents_helpers import changed, collecting, saved, settings
 
-from endless_gym_agents import checkpoint, enjoy, probe, protocol, record
-from endless_gym_agents import train as training
-from endless_gym_agents.clock import Clock
-from endless_gym_agents.evaluate import evaluate
-from endless_gym_agents.logs import read_progress
-from endless_gym_agents.ppo import learn, make_optimizer
-from endless_gym_agents.results import label
+from endless_gym_agents.common.clock import Clock
+from endless_gym_agents.evaluation import enjoy, probe, protocol, record
+from endless_gym_agents.evaluation.evaluate import evaluate
+from endless_gym_agents.evaluation.results import label
 from endless_gym_agents.settings import PRESETS
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training import train as training
+from endless_gym_agents.training.logs import read_progress
+from endless_gym_agents.training.ppo import learn, make_optimizer
 
 PAGE = Path(__file__).parents[2] / "docs" / "train" / "own-agents.md"
 PROGRAMS = {"endless-train": training.main, "endless-eval": protocol.main, "endless-enjoy": enjoy.main}

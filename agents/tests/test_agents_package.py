@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 from agents_helpers import saved, settings
 
-from endless_gym_agents import plot, reproduce, search, train
+from endless_gym_agents.evaluation import plot
+from endless_gym_agents.paper import reproduce, search
+from endless_gym_agents.training import train
 
 #: Plays two episodes with the agent of a run, without the packages of the extras.
 ACTS = """

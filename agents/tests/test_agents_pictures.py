@@ -16,13 +16,13 @@ from PIL import Image
 
 from endless_gym.env import Env
 from endless_gym.specs import spec
-from endless_gym_agents import enjoy, plot, video
-from endless_gym_agents.agent import make_agent
-from endless_gym_agents.curves import aggregate, evaluated, published, scale
-from endless_gym_agents.palette import AGENTS
-from endless_gym_agents.plot import PlotArguments, draw_all
-from endless_gym_agents.results import Experiment, Run, to_json
-from endless_gym_agents.train import train
+from endless_gym_agents.agent.agent import make_agent
+from endless_gym_agents.common.palette import AGENTS
+from endless_gym_agents.evaluation import enjoy, plot, video
+from endless_gym_agents.evaluation.curves import aggregate, evaluated, published, scale
+from endless_gym_agents.evaluation.plot import PlotArguments, draw_all
+from endless_gym_agents.evaluation.results import Experiment, Run, to_json
+from endless_gym_agents.training.train import train
 
 GRID = "MortarMayhem-Grid-v0"
 

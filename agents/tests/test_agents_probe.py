@@ -8,8 +8,8 @@ import pytest
 import torch
 from agents_helpers import saved, settings
 
-from endless_gym_agents import probe
-from endless_gym_agents.probe import Recording, Score
+from endless_gym_agents.evaluation import probe
+from endless_gym_agents.evaluation.probe import Recording, Score
 
 ID = "Endless-MysteryPath-v0"
 

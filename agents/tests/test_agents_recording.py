@@ -11,8 +11,8 @@ import pytest
 from agents_helpers import saved, settings
 
 from endless_gym.recording import record
-from endless_gym_agents.evaluate import evaluate
-from endless_gym_agents.record import AgentPlayer
+from endless_gym_agents.evaluation.evaluate import evaluate
+from endless_gym_agents.evaluation.record import AgentPlayer
 
 pytestmark = pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
 
@@ -71,7 +71,15 @@ def test_sampled_actions_depend_only_on_the_seed(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_command_records_a_checkpoint(tmp_path: Path, root: Path) -> None:
     make("gru", tmp_path / "run")
-    command = [sys.executable, "-m", "endless_gym_agents.record", tmp_path / "run", "--episodes", "3", "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "endless_gym_agents.evaluation.record",
+        tmp_path / "run",
+        "--episodes",
+        "3",
+        "--json",
+    ]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert ran.returncode == 0, ran.stderr
     result = json.loads(ran.stdout)

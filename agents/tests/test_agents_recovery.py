@@ -14,12 +14,12 @@ import pytest
 from agents_helpers import changed
 from test_agents_training import GRID, progress, same, small
 
-import endless_gym_agents.train as train_module
+import endless_gym_agents.training.train as train_module
 from endless_gym import EngineLost, make_vec, serve
-from endless_gym_agents import checkpoint
-from endless_gym_agents.environments import Environments
-from endless_gym_agents.recovery import MAX_RESTARTS, RecoverableEngine
-from endless_gym_agents.train import train
+from endless_gym_agents.environments.groups import Environments
+from endless_gym_agents.environments.recovery import MAX_RESTARTS, RecoverableEngine
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.train import train
 
 UPDATES = 4
 PARTS = ("update", "steps", "model", "optimizer", "generators", "player", "episodes")

@@ -11,15 +11,15 @@ import torch
 from agents_helpers import changed, collecting, settings
 from torch import Tensor, nn
 
-from endless_gym_agents import repeats
-from endless_gym_agents.agent import Agent
-from endless_gym_agents.clock import Clock
-from endless_gym_agents.encoders import FRAME
-from endless_gym_agents.memory import MemoryState
-from endless_gym_agents.ppo import minibatch_loss
-from endless_gym_agents.repeats import EmbeddedFrames
-from endless_gym_agents.rollout import Segment
+from endless_gym_agents.agent.agent import Agent
+from endless_gym_agents.agent.encoders import FRAME
+from endless_gym_agents.common.clock import Clock
+from endless_gym_agents.memories.memory import MemoryState
 from endless_gym_agents.settings import Settings
+from endless_gym_agents.training import repeats
+from endless_gym_agents.training.ppo import minibatch_loss
+from endless_gym_agents.training.repeats import EmbeddedFrames
+from endless_gym_agents.training.rollout import Segment
 
 ENVS, STEPS = 4, 12
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from agents_helpers import EXPERIMENT, changed
 
-from endless_gym_agents import command
-from endless_gym_agents.curves import published
-from endless_gym_agents.experiments import definitions, planning, report
-from endless_gym_agents.reproduce import ReproduceArguments, execute
+from endless_gym_agents.common import command
+from endless_gym_agents.evaluation.curves import published
+from endless_gym_agents.paper.experiments import definitions, planning, report
+from endless_gym_agents.paper.reproduce import ReproduceArguments, execute
 from endless_gym_agents.settings import to_dict
-from endless_gym_agents.train import parse
+from endless_gym_agents.training.train import parse
 
 NAMES = definitions.names()
 

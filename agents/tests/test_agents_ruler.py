@@ -13,11 +13,12 @@ import torch
 from agents_helpers import changed
 
 from endless_gym import spec
-from endless_gym_agents import checkpoint, ruler
-from endless_gym_agents import train as training
-from endless_gym_agents.agent import make_agent
-from endless_gym_agents.experiments.definitions import settings_of
-from endless_gym_agents.ruler import TASKS
+from endless_gym_agents.agent.agent import make_agent
+from endless_gym_agents.evaluation import ruler
+from endless_gym_agents.evaluation.ruler import TASKS
+from endless_gym_agents.paper.experiments.definitions import settings_of
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training import train as training
 
 PROGRAM = Path(__file__).parents[1] / "benches" / "leaderboard.py"
 

@@ -20,17 +20,18 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from endless_gym.specs import all_specs
-from endless_gym_agents import checkpoint, enjoy, export, plot, ppo, protocol
-from endless_gym_agents.agent import Agent
-from endless_gym_agents.clock import Clock
-from endless_gym_agents.command import STOP_SIGNALS
-from endless_gym_agents.environments import Environments
-from endless_gym_agents.evaluate import evaluate
-from endless_gym_agents.logs import read_progress
-from endless_gym_agents.rollout import RolloutCollector
-from endless_gym_agents.run_folder import RunInUse, locked
+from endless_gym_agents.agent.agent import Agent
+from endless_gym_agents.common.clock import Clock
+from endless_gym_agents.common.command import STOP_SIGNALS
+from endless_gym_agents.environments.groups import Environments
+from endless_gym_agents.evaluation import enjoy, export, plot, protocol
+from endless_gym_agents.evaluation.evaluate import evaluate
 from endless_gym_agents.settings import PAPER_STEPS_PER_UPDATE, PRESETS, Settings, paper_run_length, value
-from endless_gym_agents.train import parse, train
+from endless_gym_agents.training import checkpoint, ppo
+from endless_gym_agents.training.logs import read_progress
+from endless_gym_agents.training.rollout import RolloutCollector
+from endless_gym_agents.training.run_folder import RunInUse, locked
+from endless_gym_agents.training.train import parse, train
 
 #: A segment, and so a minibatch, of one step.
 ONE_STEP = "--environment.num-envs 1 --ppo.steps 1 --recurrence.sequence-length 1"

@@ -11,12 +11,12 @@ import pytest
 from agents_helpers import changed, settings
 from rich.console import Console
 
-from endless_gym_agents import jobs, search
-from endless_gym_agents.search import parse
-from endless_gym_agents.search_space import single_changes, space, with_choices
-from endless_gym_agents.search_study import SearchArguments, Trials
+from endless_gym_agents.paper import jobs, search
+from endless_gym_agents.paper.search import parse
+from endless_gym_agents.paper.search_space import single_changes, space, with_choices
+from endless_gym_agents.paper.search_study import SearchArguments, Trials
 from endless_gym_agents.settings import PRESETS, Settings, value
-from endless_gym_agents.train import train
+from endless_gym_agents.training.train import train
 
 QUIET = Console(quiet=True)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from endless_gym_agents.statistics import interquartile_mean, stratified_bootstrap, summarise
+from endless_gym_agents.evaluation.statistics import interquartile_mean, stratified_bootstrap, summarise
 
 
 @pytest.mark.parametrize(

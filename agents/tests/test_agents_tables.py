@@ -8,8 +8,9 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from endless_gym_agents import probe, protocol, tables
-from endless_gym_agents.results import Experiment, Run
+from endless_gym_agents.common import tables
+from endless_gym_agents.evaluation import probe, protocol
+from endless_gym_agents.evaluation.results import Experiment, Run
 
 
 def evaluated() -> Table:

@@ -19,14 +19,14 @@ from agents_helpers import changed, collecting, settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from endless_gym import make_vec
-from endless_gym_agents import checkpoint
-from endless_gym_agents.clock import Clock
-from endless_gym_agents.command import STOP_SIGNALS
-from endless_gym_agents.environments import Environments
-from endless_gym_agents.evaluate import evaluate, mean
-from endless_gym_agents.ppo import learn, make_optimizer
+from endless_gym_agents.common.clock import Clock
+from endless_gym_agents.common.command import STOP_SIGNALS
+from endless_gym_agents.environments.groups import Environments
+from endless_gym_agents.evaluation.evaluate import evaluate, mean
 from endless_gym_agents.settings import PRESETS, Settings
-from endless_gym_agents.train import check_resumable, choose_device, parse, restore_generator, train
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.ppo import learn, make_optimizer
+from endless_gym_agents.training.train import check_resumable, choose_device, parse, restore_generator, train
 
 GRID = "MortarMayhem-Grid-v0"
 

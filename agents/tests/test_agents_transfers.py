@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from endless_gym_agents.transfers import HostCopy
+from endless_gym_agents.training.transfers import HostCopy
 
 CHECKS = ["copies", "early_release", "killed_engine", "closing", "kept_arrays", "rollouts", "training"]
 

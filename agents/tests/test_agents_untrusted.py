@@ -13,7 +13,9 @@ from agents_helpers import saved, settings
 from rich.table import Table
 
 from endless_gym.printable import printable
-from endless_gym_agents import checkpoint, command, export, protocol, tables, train
+from endless_gym_agents.common import command, tables
+from endless_gym_agents.evaluation import export, protocol
+from endless_gym_agents.training import checkpoint, train
 
 #: Escape sequences of 7 and of 8 bits, a bell, a line break, a direction of text, rich's markup, and a byte that is not UTF-8.
 HOSTILE = "\x1b]0;t\x07\x9b2J\n\r\u202e[/red]:smile:\udcff"

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from test_agents_training import small
 
-from endless_gym_agents.environments import Environments
+from endless_gym_agents.environments.groups import Environments
 
 
 def test_the_page_shows_the_runs_engine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

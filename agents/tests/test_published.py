@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from endless_gym_agents.curves import _published
+from endless_gym_agents.evaluation.curves import _published
 
 RESULTS = Path(__file__).parents[2] / "tests/reference/published_results.json.gz"
 

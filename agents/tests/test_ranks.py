@@ -17,10 +17,10 @@ import pytest
 import torch
 
 import endless_gym
-from endless_gym_agents import checkpoint
-from endless_gym_agents.logs import PROGRESS, read_progress
-from endless_gym_agents.ranks import Ranks
-from endless_gym_agents.train import parse, train
+from endless_gym_agents.environments.ranks import Ranks
+from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.logs import PROGRESS, read_progress
+from endless_gym_agents.training.train import parse, train
 
 ARGUMENTS = " ".join(
     (

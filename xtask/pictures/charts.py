@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 from matplotlib.transforms import blended_transform_factory
 
-from endless_gym_agents.palette import AGENTS as AGENT_COLOURS
+from endless_gym_agents.common.palette import AGENTS as AGENT_COLOURS
 
 matplotlib.use("svg")
 

@@ -4,6 +4,6 @@ Each file derives a class from `sequence_model.SequenceModel`, as a class of you
 `--agent module:Class`.
 """
 
-from endless_gym_agents.own import MEMORIES
+from endless_gym_agents.common.own import MEMORIES
 
 __all__ = ["MEMORIES"]

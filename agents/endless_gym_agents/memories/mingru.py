@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from endless_gym_agents.kernels import KernelMinGRU, kernels_are_faster
+from endless_gym_agents.memories.kernels import KernelMinGRU, kernels_are_faster
 from endless_gym_agents.memories.scans import linear_scan
 from endless_gym_agents.memories.sequence_model import SequenceModel, State
 

@@ -8,9 +8,9 @@ import torch
 
 import endless_gym
 from endless_gym_agents import load
-from endless_gym_agents.evaluate import evaluate, mean
+from endless_gym_agents.evaluation.evaluate import evaluate, mean
 from endless_gym_agents.settings import PRESETS, Settings
-from endless_gym_agents.train import train
+from endless_gym_agents.training.train import train
 
 
 def main(folder: str) -> None:

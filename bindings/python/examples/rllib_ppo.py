@@ -29,10 +29,10 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 
-from endless_gym_agents.encoders import FRAME, Encoder
-from endless_gym_agents.heads import PolicyHead, ValueHead
-from endless_gym_agents.recurrence import packed_layers
-from endless_gym_agents.recurrent import RecurrentMemory
+from endless_gym_agents.agent.encoders import FRAME, Encoder
+from endless_gym_agents.agent.heads import PolicyHead, ValueHead
+from endless_gym_agents.memories.recurrence import packed_layers
+from endless_gym_agents.memories.recurrent import RecurrentMemory
 from endless_gym_agents.settings import Recurrence
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from endless_gym_agents import losses
+from endless_gym_agents.training import losses
 
 CLIP_RANGE, CHOICES = 0.25, (3, 2)
 

@@ -1,0 +1,1 @@
+"""What every room uses: files, ranges of settings, command lines, tables."""

@@ -1,0 +1,1 @@
+"""The environments that agents play: vectors of them, wrappers, replacement of a lost engine, metrics."""

@@ -1,0 +1,1 @@
+"""Evaluation: episodes, results, statistics, plots, films, probes, exports."""

@@ -1,0 +1,158 @@
+"""Tasks that measure one thing about a memory each, and what their scores are between.
+
+The score of a task is a return. It is normalised so that 0 is what an agent without memory reaches after the same training, and
+1 is what the scripted expert reaches. A task has a gate: an agent without memory must stay below half of the way from random
+actions to the expert, or else the task does not measure memory.
+
+```console
+python -m endless_gym_agents.ruler          # plays experts and random actions, and prints the tasks
+```
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endless_gym.create import make_vec
+from endless_gym.experts import Experts
+from endless_gym.specs import spec
+from endless_gym_agents.common import command
+from endless_gym_agents.settings import Environment, Settings
+
+#: What a task measures: which of several things was seen; where something is; in which order things were seen; how many.
+Label = Literal["object", "spatial", "sequential", "capacity"]
+#: Share of the way from random actions to the expert that an agent without memory must not reach.
+GATE = 0.5
+#: Seeds of the episodes of experts and random actions; the evaluation's first ones.
+SEEDS = range(200_000, 200_400)
+#: The wrapper with which the agents play POPGym.
+VECTORS = "endless_gym_agents.popgym:Vectors"
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task of the ruler.
+
+    Attributes:
+        name: Name, unique in the ruler.
+        label: What it measures.
+        env: Environment id.
+        expert: Mean return of the expert in episodes of `SEEDS`.
+        random: Mean return of random actions in the same episodes.
+        options: Reset parameters, each as NAME=VALUE.
+        longer: Environment id and reset parameters of a longer version, on which trained agents are evaluated; None if none fits
+            their observations and actions.
+        observable: Id of the fully observable variant; empty if there is none.
+    """
+
+    name: str
+    label: Label
+    env: str
+    expert: float
+    random: float
+    options: tuple[str, ...] = ()
+    longer: tuple[str, tuple[str, ...]] | None = None
+    observable: str = ""
+
+    def flags(self) -> dict[str, Any]:
+        """Flags of `endless-train` for this task, without `env`."""
+        chosen: dict[str, Any] = {"environment.option": list(self.options)} if self.options else {}
+        popgym: dict[str, Any] = {"environment.wrapper": [VECTORS], "environment.observation": "features"}
+        return chosen | (popgym if self.env.startswith("popgym") else {})
+
+    def passes_gate(self, memoryless: float) -> bool:
+        """Whether an agent without memory with this mean return fails the task, as it must."""
+        return memoryless < self.random + GATE * (self.expert - self.random)
+
+    def normalised(self, score: float, memoryless: float) -> float:
+        """A mean return between that of an agent without memory, 0, and that of the expert, 1."""
+        return (score - memoryless) / (self.expert - memoryless)
+
+
+def _mayhem(
+    name: str, label: Label, expert: float, random: float, options: tuple[str, ...], longer: tuple[str, ...]
+) -> Task:
+    grid, observable = "MortarMayhem-Grid-v0", "MortarMayhemB-Grid-v0"
+    return Task(name, label, grid, expert, random, options, (grid, longer), observable)
+
+
+_OPEN = ("show_origin=true", "show_goal=true")
+_LATE = "command_count=[1]", "command_show_delay=[20]"
+
+#: The tasks. The numbers of experts and random actions are those that the program prints.
+TASKS = {
+    task.name: task
+    for task in (
+        _mayhem("one-command", "object", 0.1, 0.0185, ("command_count=[1]",), ("command_count=[2]",)),
+        _mayhem("two-commands", "sequential", 0.2, 0.0195, ("command_count=[2]",), ("command_count=[3]",)),
+        _mayhem("three-commands", "sequential", 0.3, 0.0177, ("command_count=[3]",), ("command_count=[5]",)),
+        _mayhem("ten-commands", "sequential", 1.0, 0.0223, ("command_count=[10]",), ("command_count=[15]",)),
+        _mayhem("late-command", "object", 0.1, 0.0143, _LATE, (_LATE[0], "command_show_delay=[60]")),
+        Task("growing-sequence", "capacity", "Endless-MortarMayhem-v0", 4.0, 0.0083, ("max_steps=1000",)),
+        Task("path", "spatial", "MysteryPath-Grid-v0", 1.802, 0.2635, (*_OPEN, "reward_path_progress=0.1")),
+        Task("path-sparse", "spatial", "MysteryPath-Grid-v0", 0.9975, 0.0075, _OPEN),
+        Task("spotlights", "object", "SearingSpotlights-v0", 1.25, 0.01),
+        Task(
+            "repeat-first", "object", "popgym-RepeatFirstEasy-v0", 1.0, -0.4943, (), ("popgym-RepeatFirstMedium-v0", ())
+        ),
+        Task("repeat-previous", "sequential", "popgym-RepeatPreviousEasy-v0", 1.0, -0.4942),
+        Task("count-recall", "capacity", "popgym-CountRecallEasy-v0", 1.0, -0.9274),
+        Task("autoencode", "capacity", "popgym-AutoencodeEasy-v0", 1.0, -0.4895),
+        Task("labyrinth", "spatial", "popgym-LabyrinthExploreEasy-v0", 0.9694, -0.3453),
+    )
+}
+
+
+def mean_return(task: Task, expert: bool, seeds: Sequence[int] = SEEDS) -> float:
+    """Mean return of the scripted expert, or of random actions, in one episode of each seed."""
+    num_envs = len(seeds)
+    generator, described = np.random.default_rng(0), spec(task.env)
+    if expert:
+        experts = Experts(task.env, num_envs)
+
+        def choose(observation: Any, start: Any) -> NDArray[Any]:
+            # The experts take numbers as vectors, too.
+            parts = observation if isinstance(observation, tuple) else (observation,)
+            return experts.act(np.concatenate([np.reshape(part, (num_envs, -1)) for part in parts], axis=1), start)
+
+    else:
+
+        def choose(observation: Any, start: Any) -> NDArray[Any]:
+            return described.batched_actions(described.random_actions(generator, num_envs))
+
+    options = Settings(environment=Environment(option=task.options)).options()
+    with make_vec(
+        task.env, num_envs, 1, options=options, seeds=list(seeds), observation="features", autoreset="same_step"
+    ) as envs:
+        observation, _ = envs.reset()
+        start, running, returns = np.ones(num_envs, np.bool_), np.ones(num_envs, np.bool_), np.zeros(num_envs)
+        while running.any():
+            observation, reward, terminated, truncated, _ = envs.step(choose(observation, start))
+            returns += np.where(running, reward, 0.0)
+            start = terminated | truncated
+            running &= ~start
+    return float(returns.mean())
+
+
+def execute() -> None:
+    """Print the tasks, with the mean returns of experts and random actions."""
+    for task in TASKS.values():
+        expert, random = (mean_return(task, expert) for expert in (True, False))
+        print(
+            f"{task.name:<17} {task.label:<11} expert {expert:7.4f}  random {random:7.4f}  {task.env} {' '.join(task.options)}"
+        )
+
+
+def main() -> int:
+    """Entry point of the program; returns the exit status."""
+    return command.run("ruler", execute)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

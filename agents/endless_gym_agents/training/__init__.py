@@ -1,0 +1,1 @@
+"""Training: the loop, rollouts, PPO, checkpoints, logs."""

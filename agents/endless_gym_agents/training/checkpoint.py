@@ -1,0 +1,333 @@
+"""Checkpoints: the state from which a run resumes, and the agent for evaluation.
+
+```python
+from endless_gym_agents import checkpoint
+
+loaded = checkpoint.load("runs/mine")    # the last checkpoint of a run, or a checkpoint file
+agent, steps = loaded.agent, loaded.steps
+```
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_tensors
+
+from endless_gym.specs import spec
+from endless_gym_agents.agent.agent import Agent, make_agent
+from endless_gym_agents.common import atomic, ranges, regular
+from endless_gym_agents.settings import Settings, Transformer, from_dict
+from endless_gym_agents.training.logs import PROGRESS
+
+#: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
+CHECKPOINT_VERSION = 1
+
+#: Versions of the files of `endless learn` and of exported agents that can be read; the last one is written.
+FILE_VERSIONS = (1, 2)
+
+#: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it. Checkpoints of
+#: `endless learn`, the trainer in Rust, end with `RUST_SUFFIX` instead.
+SETTINGS = "settings.json"
+FOLDER = "checkpoints"
+LAST = "last.pt"
+RUST_SUFFIX = ".safetensors"
+
+#: Longest header of such a file in bytes: far more than a network needs, and few enough to read at once.
+_MAX_HEADER = 4 << 20
+
+
+@dataclass
+class Checkpoint:
+    """A loaded checkpoint.
+
+    Attributes:
+        settings: Settings of the run.
+        agent: The agent with the weights of the checkpoint, in evaluation mode.
+        update: Number of updates so far.
+        steps: Number of environment steps so far.
+        state: The saved state; see `save`.
+    """
+
+    settings: Settings
+    agent: Agent
+    update: int
+    steps: int
+    state: dict[str, Any]
+
+    def resumable(self) -> dict[str, Any]:
+        """The saved state, with everything that a run needs to resume.
+
+        Raises:
+            ValueError: It has only what evaluation needs.
+        """
+        if missing := [name for name in ("optimizer", "generators", "player", "episodes") if name not in self.state]:
+            raise ValueError(
+                f"the checkpoint cannot be resumed: it has no {', '.join(missing)}; start a new run with --init-from"
+            )
+        return self.state
+
+
+@contextlib.contextmanager
+def checked(run: Path) -> Iterator[None]:
+    """Report a state of the last checkpoint of a run that does not fit the run as `ValueError`."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"checkpoint {run / FOLDER / LAST} cannot be resumed, as its state is invalid: {error}"
+        ) from error
+
+
+def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
+    """Write a checkpoint as the last one of a run, atomically.
+
+    Args:
+        run: Folder of the run.
+        state: `settings` (from `to_dict`), `update`, `steps`, `model`; and to resume, `optimizer`, `generators`, `player` (the
+            state of the rollout collector) and `episodes`.
+        keep: Also keep the checkpoint under the number of its update.
+
+    Returns:
+        Path of the last checkpoint.
+
+    Raises:
+        OSError: The file cannot be written, as on a full disk. The former checkpoint stays the last one.
+    """
+    folder = run / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    # torch reports a file that cannot be written without the reason.
+    content = io.BytesIO()
+    torch.save({"version": CHECKPOINT_VERSION} | state, content)
+    if keep:
+        # First, since a run that resumes from the last one does not write its number again.
+        atomic.write(folder / f"update-{state['update']:06d}.pt", content.getbuffer())
+    atomic.write(folder / LAST, content.getbuffer())
+    return folder / LAST
+
+
+def files(run: str | Path) -> list[Path]:
+    """The numbered checkpoints of a run in order of their updates, or the last checkpoint if there are none."""
+    file = last(run)
+    return sorted(file.parent.glob(f"update-*{file.suffix}")) or [file]
+
+
+def last(run: str | Path) -> Path:
+    """The last checkpoint of a run, which may not exist."""
+    file = Path(run) / FOLDER / LAST
+    of_rust = file.with_suffix(RUST_SUFFIX)
+    return of_rust if of_rust.exists() and not file.exists() else file
+
+
+def protected(path: str | Path) -> list[Path]:
+    """The files that a program that reads this checkpoint must not overwrite: it, and the settings, log and checkpoints.
+
+    Args:
+        path: As for `load`.
+    """
+    file = last(path) if Path(path).is_dir() else Path(path)
+    if file.parent.name != FOLDER:
+        return [file]
+    run = file.parent.parent
+    return [file, run / SETTINGS, run / PROGRESS, *file.parent.glob("*")]
+
+
+def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
+    """Load a checkpoint.
+
+    Args:
+        path: A checkpoint file, or the folder of a run for its last checkpoint.
+        device: Device of the agent.
+
+    Raises:
+        FileNotFoundError: There is no such checkpoint.
+        ValueError: The file is not a checkpoint, is truncated or damaged, or of another version, its weights do not fit its
+            settings, or are not finite.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = last(file)
+    if not file.exists():
+        raise FileNotFoundError(
+            f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
+        )
+    versions: tuple[int, ...] = (CHECKPOINT_VERSION,)
+    if file.suffix == RUST_SUFFIX:
+        state, versions = _read_of_rust(file), FILE_VERSIONS
+    else:
+        with regular.opened(file) as content:
+            state = _read(content, file)
+    if (version := state.get("version")) not in versions:
+        raise ValueError(
+            f"checkpoint {file} must be of version {' or '.join(map(str, versions))}, got {version}; "
+            "use the version of endless-gym that wrote it"
+        )
+    if missing := [name for name in ("settings", "update", "steps", "model") if name not in state]:
+        raise ValueError(f"checkpoint {file} is incomplete: it has no {', '.join(missing)}")
+    try:
+        # A small file may have tensors of any size, whose strides repeat a few numbers.
+        claimed, size = sum(weights.nbytes for weights in state["model"].values()), file.stat().st_size
+        if claimed > size:
+            raise ValueError(f"its weights claim {claimed} bytes, and the file has {size}")
+        agent, settings = _agent(state, device)
+    except Exception as error:  # of settings of any content, `load_state_dict`, and modules of the user's own
+        reason = str(error).replace("\n\t", " ")
+        raise ValueError(
+            f"checkpoint {file} cannot be used, as its settings or weights are invalid: {reason}"
+        ) from error
+    broken = [name for name, weights in agent.state_dict().items() if not bool(weights.isfinite().all())]
+    if broken:
+        raise ValueError(
+            f"checkpoint {file} has weights that are not finite, in {broken[0]}: its run had diverged; use an earlier "
+            "checkpoint, or train again with a smaller --ppo.learning-rate"
+        )
+    agent.eval()
+    return Checkpoint(settings, agent, state["update"], state["steps"], state)
+
+
+def _read(content: BinaryIO, file: Path) -> dict[str, Any]:
+    """The saved state, in which nothing has been checked yet except that all of it is as it was written."""
+    try:
+        with zipfile.ZipFile(content) as archive:
+            # `torch.save` does not compress. A small file could have parts that decompress to any size.
+            compressed = [part.filename for part in archive.infolist() if part.compress_type != zipfile.ZIP_STORED]
+            # `torch.load` does not compare the parts with their checksums.
+            damaged = compressed[0] if compressed else archive.testzip()
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{file} is not a checkpoint, or is truncated: {error}") from error
+    if damaged is not None:
+        raise ValueError(f"checkpoint {file} is damaged: its part {damaged} has changed since it was written")
+    content.seek(0)
+    try:
+        # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
+        state = torch.load(content, map_location="cpu", weights_only=True)
+    except Exception as error:  # of many types
+        raise ValueError(f"{file} is not a checkpoint of endless-train: {str(error).splitlines()[0]}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{file} is not a checkpoint of endless-train: it has a {type(state).__name__}, not a dict")
+    return state
+
+
+def _read_of_rust(file: Path) -> dict[str, Any]:
+    """As `_read`, of a checkpoint of `endless learn`, without what only that program needs to resume."""
+    with regular.opened(file) as content:
+        if (header := int.from_bytes(content.read(8), "little")) > _MAX_HEADER:
+            raise ValueError(
+                f"{file} is not a file of safetensors, or has far more tensors than a network: its header claims {header} bytes, "
+                f"at most {_MAX_HEADER} are allowed"
+            )
+    try:
+        with safe_open(file, "pt") as content:
+            metadata = content.metadata() or {}
+            tensors = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{file} is not a file of safetensors, or is truncated: {error}") from error
+    if "endless" not in metadata:
+        raise ValueError(f"{file} is not a checkpoint of `endless learn`: it has weights only")
+    try:
+        header = json.loads(metadata["endless"])
+        state = {name: header[name] for name in ("version", "settings", "update", "steps")}
+        version, has_checksum = state["version"], "crc32" in metadata or state["version"] != 1
+        expected = _checksum(version, metadata["endless"], tensors) if version in FILE_VERSIONS else ""
+        if expected and has_checksum and metadata.get("crc32") != expected:
+            raise ValueError("its checksum differs")
+        model = {name: tensor for name, tensor in tensors.items() if not name.startswith("state/")}
+        if other := [f"{tensor.dtype} in {name}" for name, tensor in model.items() if tensor.dtype != torch.float32]:
+            raise ValueError(f"its weights must be float32, got {other[0]}")
+    except (KeyError, RecursionError, TypeError, ValueError) as error:
+        raise ValueError(f"checkpoint {file} is damaged: {error}") from error
+    return state | {"model": model}
+
+
+def to_safetensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any] | None = None) -> bytes:
+    """A file of an agent, as docs/train/rust.md describes it.
+
+    Args:
+        tensors: Weights by name, float32, on the CPU and contiguous.
+        header: The header without its version, which is added; `None` for a file of weights alone.
+    """
+    version = FILE_VERSIONS[-1]
+    text = "" if header is None else json.dumps({"version": version, **header}, separators=(",", ":"))
+    metadata = {"crc32": _checksum(version, text, tensors)} | ({"endless": text} if text else {})
+    return save_tensors(dict(tensors), metadata)
+
+
+def _checksum(version: int, header: str, tensors: Mapping[str, torch.Tensor]) -> str:
+    """As in the crate `endless-gym-kernels`, which defines it."""
+    names = {torch.float32: "F32", torch.uint8: "U8", torch.uint64: "U64"}
+    total = zlib.crc32(header.encode())
+    for name, tensor in sorted(tensors.items()):
+        described = f"{name} {names.get(tensor.dtype)} {list(tensor.shape)}" if version > 1 else name
+        total = zlib.crc32(tensor.numpy().tobytes(), zlib.crc32(described.encode(), total))
+    return f"{total:08x}"
+
+
+def _agent(state: dict[str, Any], device: torch.device | str) -> tuple[Agent, Settings]:
+    """The agent of a saved state, and its settings."""
+    settings, model = from_dict(state["settings"]), state["model"]
+    ranges.check(settings)
+    for layers in (settings.recurrence.layers, settings.transformer.layers):
+        if layers > max(len(model), Transformer.layers):
+            raise ValueError(f"{layers} layers need more weights than the checkpoint's {len(model)}")
+    if not (":" in settings.agent or settings.encoder):
+        # Without memory for the weights, whose sizes the settings may exaggerate.
+        with torch.device("meta"):
+            expected = make_agent(settings, spec(settings.env), "meta").state_dict()
+        for name, tensor in expected.items():
+            if name not in model:
+                raise ValueError(f"there are no weights {name}")
+            if model[name].shape != tensor.shape:
+                given, wanted = tuple(model[name].shape), tuple(tensor.shape)
+                raise ValueError(f"{name} must have shape {wanted} according to the settings, got {given}")
+    agent = make_agent(settings, spec(settings.env), device)
+    agent.load_state_dict(model)
+    return agent, settings
+
+
+def start_from(agent: Agent, path: str | Path) -> str:
+    """Copy the weights of a checkpoint into an agent. The encoder and the heads keep their values where the shapes differ.
+
+    Returns:
+        A line of text that says which weights were copied.
+
+    Raises:
+        FileNotFoundError: As for `load`.
+        ValueError: As for `load`, or the memories or the layers after them differ.
+    """
+    own = agent.state_dict()
+    given = load(path).agent.state_dict()
+    fitting = {name: part for name, part in given.items() if name in own and own[name].shape == part.shape}
+    missing = sorted(own.keys() - fitting.keys())
+    core = [name for name in missing if name.startswith(("memory.", "body."))]
+    if core or not fitting:
+        raise ValueError(
+            f"--init-from {path}: its {', '.join(core)} do not fit this agent's; use the same --agent and sizes"
+        )
+    agent.load_state_dict(own | fitting)
+    others = f"; newly initialised: {', '.join(missing)}" if missing else ""
+    return f"started from {len(fitting)} of {len(own)} tensors of {path}{others}"
+
+
+def read_settings(run: str | Path) -> Settings:
+    """Read the settings of the run in folder `run`.
+
+    Raises:
+        FileNotFoundError: The folder contains no run.
+        ValueError: The run is of another program, or of another version of this one.
+    """
+    if not (Path(run) / SETTINGS).exists():
+        raise FileNotFoundError(f"no run in {run}; expected a folder with {SETTINGS}, as endless-train writes it")
+    try:
+        return from_dict(json.loads(regular.text(Path(run) / SETTINGS)))
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise ValueError(f"{Path(run) / SETTINGS} is not of this version of endless-train ({error})") from None
