@@ -56,7 +56,7 @@ fn pinned_threads_have_a_cpu_each() {
         let shape = format!("serve --env=MortarMayhem-Grid-v0 --num-envs=64 --service={name} --pin-threads");
         let count = format!("--threads={threads} --groups={groups}");
         let arguments: Vec<_> = shape.split(' ').chain(count.split(' ')).collect();
-        Process::spawn(place.endless(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()))
+        Process::spawn(place.endless(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()))
     };
     let mut refused = start("refused", all + 1, all + 1);
     assert_eq!(refused.wait().code(), Some(1));
