@@ -47,7 +47,7 @@ pub struct Trainer {
     groups: Vec<TrainerGroup>,
 }
 
-/// The groups from which [`Trainer::from_groups`](Trainer::from_groups) could not make a trainer.
+/// The groups from which [`Trainer::from_groups`] could not make a trainer.
 #[derive(Debug)]
 #[non_exhaustive]
 pub struct GroupsError {
