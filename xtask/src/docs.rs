@@ -1,7 +1,6 @@
 //! The documentation: MkDocs' pages and rustdoc's reference as one site under the target directory.
 
 use std::fs;
-use std::path::Path;
 use std::process::Command;
 
 use crate::shell::{cargo, describe, output, run, target, workspace};
