@@ -95,7 +95,7 @@ impl Environment for MysteryPath {
     fn info(&self, out: &mut [f64]) {
         match self.assets.config.variant {
             Variant::Free | Variant::Grid => {
-                out.copy_from_slice(&self.state.finite_info(&self.assets.config.parameters))
+                out.copy_from_slice(&self.state.finite_info(&self.assets.config.parameters));
             }
             Variant::Endless => out.copy_from_slice(&self.state.endless_info()),
         }
