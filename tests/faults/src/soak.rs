@@ -4,21 +4,23 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym::environments;
 use endless_gym_core::random::Generator;
 use endless_gym_service::Namespace;
+use rustix::process::Signal;
 use serde::Serialize;
 
 use crate::actors::{self, Actor};
 use crate::cleanliness;
+use crate::event::now;
 use crate::plan::{Plan, Role};
 use crate::report::Outcome;
 use crate::round;
 use crate::run::{duration, new_namespace, random_seed, stop_on_signal};
-use crate::scene::Scene;
+use crate::scene::{LIMIT, Scene};
 use crate::shape::Shape;
 
 /// Growth that is not a leak, since pictures for other options take different amounts of memory.
@@ -27,6 +29,8 @@ const MEMORY: u64 = 16 << 20;
 /// test `replaced_options_leave_no_memory_behind` shows that they are freed.
 const DARK_PICTURES: u64 = 28 << 20;
 const DESCRIPTORS: u64 = 4;
+/// For a process that only starts others.
+const OWN_MEMORY: u64 = 2 << 20;
 const SEGMENTS: u64 = 8;
 
 /// Arguments of `soak`.
@@ -35,6 +39,9 @@ pub struct Args {
     /// Duration of the run; each id gets the same share of it.
     #[arg(long, default_value_t = 60.0)]
     minutes: f64,
+    /// Start and stop this many engines and trainers instead, in every way.
+    #[arg(long)]
+    starts: Option<u64>,
     /// The seed of options, formats and actions [default: random].
     #[arg(long)]
     seed: Option<u64>,
@@ -128,6 +135,9 @@ pub fn run(args: &Args) -> Result<(), String> {
     let seed = args.seed.map_or_else(random_seed, Ok)?;
     let stop = stop_on_signal()?;
     println!("seed {seed}");
+    if let Some(count) = args.starts {
+        return starts(count, seed, &stop);
+    }
     let ids: Vec<&str> = environments().specs().map(|spec| spec.id).collect();
     let mut draws = Generator::from_seed(seed);
     let start = Instant::now();
@@ -159,6 +169,69 @@ pub fn run(args: &Args) -> Result<(), String> {
         phases.push(phase);
     }
     summary(args, seed, start.elapsed(), &phases)
+}
+
+/// Starts and stops engines and trainers in one namespace. Nothing of them may be left, and this process must not grow.
+fn starts(count: u64, seed: u64, stop: &AtomicBool) -> Result<(), String> {
+    let (start, mut draws, namespace) = (Instant::now(), Generator::from_seed(seed), new_namespace()?);
+    let (mut total, mut usages) = (Outcome::default(), Vec::new());
+    for number in 1..=count {
+        if stop.load(Ordering::Relaxed) {
+            break;
+        }
+        let plan = Plan {
+            shape: Shape::random(&mut draws, 4),
+            trainer_seed: draws.integers(0, 1 << 40) as u64,
+            with_options: false,
+            think: 0,
+            observers: 0,
+            visitors: 0,
+            own_memory: None,
+            steps: Vec::new(),
+        };
+        let mut scene = Scene::new(&plan, namespace.clone());
+        scene.start(Role::Engine)?;
+        scene.start(Role::Trainer)?;
+        if scene.next_batch(now(), LIMIT)?.is_none() {
+            scene.fail("no batches", format!("the trainer has not played within {LIMIT:?}"));
+        }
+        match draws.integers(0, 6) {
+            0 => scene.end(Role::Engine, |engine| engine.signal(Signal::TERM))?,
+            1 => scene.end(Role::Engine, |engine| engine.signal(Signal::INT))?,
+            2 => scene.kill(Role::Engine),
+            3 => scene.kill(Role::Trainer),
+            4 => scene.end(Role::Trainer, Actor::close_input)?,
+            _ => scene.end(Role::Engine, Actor::close_input)?,
+        }
+        round::end(&mut scene)?;
+        scene.close();
+        for left in cleanliness::leftovers(&namespace) {
+            scene.fail("left behind", left);
+        }
+        for failure in &scene.outcome.failures {
+            println!("start {number}: FAILED: {}: {}\n    {:?}", failure.kind, failure.text, plan.shape);
+        }
+        total.add(scene.outcome);
+        let own = std::process::id();
+        let (memory, descriptors) = (memory(own), descriptors(own));
+        usages.push((memory, descriptors));
+        if number.is_multiple_of(100) || number == count {
+            let (failures, seconds) = (total.failures.len(), start.elapsed().as_secs());
+            println!(
+                "{number} starts in {seconds} s, {failures} failures, own memory {memory}, {descriptors} descriptors"
+            );
+        }
+    }
+    cleanliness::remove_all(&namespace);
+    // The allocator's arenas grow during the first starts.
+    let (Some(before), Some(after)) = (usages.get(usages.len() / 10), usages.last()) else {
+        return Err("no engine was started".to_owned());
+    };
+    if after.0 > before.0 + OWN_MEMORY || after.1 > before.1 {
+        return Err(format!("memory and descriptors have grown from {before:?} to {after:?}; seed {seed}"));
+    }
+    println!("{} batches compared, {} failures", total.batches, total.failures.len());
+    if total.failures.is_empty() { Ok(()) } else { Err(format!("{} failures; seed {seed}", total.failures.len())) }
 }
 
 fn phase(
