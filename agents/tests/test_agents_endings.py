@@ -1,5 +1,6 @@
 """How runs end before their last update: divergence, signals, and other processes in the same folder."""
 
+import errno
 import json
 import os
 import pty
@@ -110,6 +111,41 @@ def test_a_run_killed_at_any_call_that_changes_its_files_continues_with_one_comm
     assert done.returncode == 0, done.stderr[-3000:]
     kills = [int(line.split()[0]) for line in done.stdout.splitlines() if line.endswith(" kills")]
     assert len(kills) == 2 and min(kills) > 20, kills
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT])
+def test_results_without_space_are_one_error_and_keep_the_former_file(error: int, tmp_path: Path) -> None:
+    library, folder, work = tmp_path / "kill_at.so", tmp_path / "results", tmp_path / "work.py"
+    source = Path(__file__).with_name("kill_at.c")
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    folder.mkdir()
+    work.write_text("""
+import ctypes, itertools, os, sys
+from pathlib import Path
+from endless_gym_agents import atomic, command, run_folder
+
+file = Path(sys.argv[1]) / "results.json"
+
+def write():
+    with run_folder.locked(file.parent):
+        atomic.write(file, "new" * 10_000)
+
+for number in itertools.count(1):
+    file.write_text("former")
+    ctypes.CDLL(None).kill_at(bytes(file.parent), number)
+    status = command.run("endless-eval", write)
+    ctypes.CDLL(None).kill_at(b"/nowhere", 0)
+    assert os.listdir(file.parent) == [file.name], number
+    if status == 0:
+        break
+    assert file.read_text() == "former", number
+""")
+    given = {"LD_PRELOAD": str(library), "KILL_ERROR": str(error)}
+    done = subprocess.run([sys.executable, work, folder], env=os.environ | given, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) >= 5 and all(f"[Errno {error}] {os.strerror(error)}" in line for line in lines), lines
+    assert [str(folder) in line for line in lines[2:]] == [True] * (len(lines) - 2), lines
 
 
 def test_a_missing_row_is_an_error(tmp_path: Path) -> None:

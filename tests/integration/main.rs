@@ -10,6 +10,7 @@ mod experts;
 mod faulty_environments;
 mod films;
 mod formats;
+mod full_disks;
 mod independent_episodes;
 mod live;
 mod meanings;

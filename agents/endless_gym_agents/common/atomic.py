@@ -35,9 +35,11 @@ def replacing(file: str | Path) -> Iterator[Path]:
         _flush(new)
         new.chmod(mode)
         new.replace(file)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             new.unlink()
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            error.filename = str(file)  # Errors of a full disk name none.
         raise
     _flush(file.parent)
 

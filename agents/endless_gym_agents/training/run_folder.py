@@ -102,10 +102,11 @@ def locked(run: Path) -> Iterator[None]:
                 warnings.warn(f"{printable(run)} cannot be locked ({error}); start only one run in it", stacklevel=2)
             if os.fstat(file.fileno()).st_nlink == 0:
                 continue  # The process that held the lock has removed the file.
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
-            file.flush()
+            text = f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n"
             try:
+                file.truncate(0)
+                # Without a buffer, which would be written again on a full disk when the file is closed.
+                os.write(file.fileno(), text.encode())
                 yield
             finally:
                 path.unlink(missing_ok=True)

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use endless_gym_core::{files, printable};
@@ -17,6 +17,7 @@ pub(crate) const PROGRESS: &str = "progress.jsonl";
 
 /// Writes the metrics of each update.
 pub struct Logger {
+    path: PathBuf,
     progress: File,
     events: Events,
     updates: u64,
@@ -46,7 +47,7 @@ impl Logger {
         }
         let progress = OpenOptions::new().append(true).create(true).open(&path).map_err(file(&path))?;
         progress.set_len(length).map_err(file(&path))?;
-        Ok(Logger { progress, events: Events::create(run)?, updates, recent: VecDeque::new() })
+        Ok(Logger { path, progress, events: Events::create(run)?, updates, recent: VecDeque::new() })
     }
 
     /// Logs one update.
@@ -73,7 +74,7 @@ impl Logger {
         // A number that is not finite becomes null.
         row.extend(numbers.iter().map(|(name, value)| (name.clone(), (*value).into())));
         let line = format!("{}\n", Json::Object(row));
-        self.progress.write_all(line.as_bytes()).map_err(file(Path::new(PROGRESS)))?;
+        self.progress.write_all(line.as_bytes()).map_err(file(&self.path))?;
         for (name, value) in numbers.iter().chain([&("steps_per_second".to_owned(), rate)]) {
             let tag = if name.contains('/') { name.clone() } else { format!("learning/{name}") };
             self.events.scalar(&tag, *value as f32, steps)?;
@@ -89,7 +90,7 @@ impl Logger {
     ///
     /// [`Error::File`].
     pub fn sync(&self) -> Result<(), Error> {
-        self.progress.sync_data().map_err(file(Path::new(PROGRESS)))
+        self.progress.sync_data().map_err(file(&self.path))
     }
 
     /// Prints one update.
@@ -136,6 +137,7 @@ fn duration(seconds: f64) -> String {
 /// A record is the length of its data (u64), a masked CRC-32C of the length, the data, and a masked CRC-32C of the data. The fields of
 /// the messages are those of `event.proto` and `summary.proto`.
 struct Events {
+    path: PathBuf,
     file: File,
 }
 
@@ -145,7 +147,8 @@ impl Events {
         let (time, host) = (unix_time(), host.nodename().to_string_lossy());
         // The fraction tells files apart that one process writes in the same second.
         let path = run.join(format!("events.out.tfevents.{time:.6}.{host}.{process}"));
-        let mut events = Events { file: File::create(&path).map_err(file(&path))? };
+        let created = File::create(&path).map_err(file(&path))?;
+        let mut events = Events { path, file: created };
         events.write(&[bytes(3, b"brain.Event:2")].concat())?;
         Ok(events)
     }
@@ -161,7 +164,7 @@ impl Events {
         let length = (data.len() as u64).to_le_bytes();
         let masked = |data: &[u8]| crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes();
         let record = [&length[..], &masked(&length), &data, &masked(&data)].concat();
-        self.file.write_all(&record).map_err(file(Path::new("events.out.tfevents")))
+        self.file.write_all(&record).map_err(file(&self.path))
     }
 }
 

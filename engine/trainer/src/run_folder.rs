@@ -112,8 +112,9 @@ fn lock(run: &Path) -> Result<File, Error> {
         let host = rustix::system::uname();
         let (process, host) = (std::process::id(), host.nodename().to_string_lossy());
         let text = format!("process {process} on {host} since {} UTC\n", now());
-        lock.set_len(0).and_then(|()| lock.write_all(text.as_bytes())).map_err(file(&path))?;
-        return Ok(lock);
+        let written = lock.set_len(0).and_then(|()| lock.write_all(text.as_bytes()));
+        // On a full disk.
+        return written.map(|()| lock).inspect_err(|_| drop(fs::remove_file(&path))).map_err(file(&path));
     }
 }
 

@@ -20,6 +20,7 @@ use endless_gym_trainer::error::Error;
 use endless_gym_trainer::learn;
 use endless_gym_trainer::network;
 use endless_gym_trainer::settings::{Settings, with_defaults, with_negations};
+use rustix::io::Errno;
 use safetensors::SafeTensors;
 use safetensors::tensor::TensorView;
 use serde_json::Value as Json;
@@ -159,9 +160,12 @@ fn kill_at(folder: &Folder) -> PathBuf {
 }
 
 #[test]
-fn a_run_killed_at_any_call_that_changes_its_files_continues_with_one_command() {
+fn a_run_killed_or_out_of_space_at_any_call_continues_with_one_command() {
     if let Ok(arguments) = std::env::var("LEARN") {
-        try_run(&arguments).unwrap();
+        if let Err(error) = try_run(&arguments) {
+            eprintln!("{error}");
+            std::process::exit(1);
+        }
         return;
     }
     let folder = Folder::new("killed");
@@ -177,28 +181,41 @@ fn a_run_killed_at_any_call_that_changes_its_files_continues_with_one_command() 
         let files = fs::read_dir(run.join("checkpoints")).unwrap();
         files.map(|file| file.unwrap().file_name()).collect::<HashSet<_>>()
     };
-    let train = |arguments: &str, kill: usize| {
+    let train = |arguments: &str, kill: usize, error: i32| {
         let mut process = Process::new(std::env::current_exe().unwrap());
-        process.args(["--exact", "a_run_killed_at_any_call_that_changes_its_files_continues_with_one_command"]);
+        process.args(["--exact", "a_run_killed_or_out_of_space_at_any_call_continues_with_one_command", "--nocapture"]);
         process.env("LEARN", arguments).env("LD_PRELOAD", &library).env("KILL_FOLDER", &run);
-        process.env("KILL_AT", kill.to_string()).output().unwrap()
+        process.env("KILL_AT", kill.to_string()).env("KILL_ERROR", error.to_string()).output().unwrap()
     };
-    for is_resumed in [false, true] {
+    let [full, quota] = [Errno::NOSPC, Errno::DQUOT].map(Errno::raw_os_error);
+    for (is_resumed, error) in
+        [false, true].into_iter().flat_map(|is_resumed| [0, full, quota].map(|e| (is_resumed, e)))
+    {
         for kill in 1.. {
             let _ = fs::remove_dir_all(&run);
             if is_resumed {
                 assert!(Process::new("cp").arg("-r").args([&half, &run]).status().unwrap().success());
             }
-            let killed = train(if is_resumed { &resume } else { &start }, kill);
+            let killed = train(if is_resumed { &resume } else { &start }, kill, error);
             let is_done = killed.status.success();
-            assert!(is_done || killed.status.signal() == Some(9), "{killed:?}");
+            if error == 0 {
+                assert!(is_done || killed.status.signal() == Some(9), "{killed:?}");
+            } else if !is_done {
+                let text = String::from_utf8(killed.stderr).unwrap();
+                assert!(text.starts_with(run.to_str().unwrap()) && text.lines().count() == 1, "{text}");
+                assert!(text.ends_with(&format!("(os error {error})\n")), "{text}");
+                let left = [run.clone(), run.join("checkpoints")].into_iter().flat_map(fs::read_dir).flatten();
+                let left: Vec<_> = left.map(|file| file.unwrap().path()).collect();
+                let is_left = |path: &&PathBuf| path.ends_with("lock") || path.extension().is_some_and(|e| e == "new");
+                assert_eq!(left.iter().find(is_left), None, "after call {kill}");
+            }
             let again = if run.join("settings.json").exists() { &resume } else { &start };
-            let ended = train(again, 0);
+            let ended = train(again, 0, 0);
             assert!(ended.status.success(), "after call {kill}: {ended:?}");
             assert_same(&whole, &run);
             assert_eq!(checkpoints(&whole), checkpoints(&run), "after call {kill}");
             if is_done {
-                assert!(kill > 20, "only {kill} calls");
+                assert!(kill > 15, "only {kill} calls");
                 break;
             }
         }

@@ -87,6 +87,14 @@ impl FilmFile {
     ///
     /// If the picture cannot be encoded or written.
     pub fn add(&mut self, pixels: &[[u8; 3]], count: u16) -> Result<(), Failure> {
+        self.encode(pixels, count).map_err(|error| self.failure(&error))
+    }
+
+    fn failure(&self, error: &Failure) -> Failure {
+        format!("cannot write {}: {error}", self.path.display()).into()
+    }
+
+    fn encode(&mut self, pixels: &[[u8; 3]], count: u16) -> Result<(), Failure> {
         let Shape { size: (width, _), scale, fps } = self.shape;
         let (start, end) = (self.duration, self.duration + u64::from(count));
         self.duration = end;
@@ -132,15 +140,16 @@ impl FilmFile {
         Ok(())
     }
 
-    /// Completes the file and renames it to its final name.
+    /// Completes the file and, once it is on disk, renames it to its final name.
     ///
     /// # Errors
     ///
     /// If the rest of the file cannot be written, or ffmpeg failed.
     pub fn finish(mut self) -> Result<(), Failure> {
         self.end()
+            .and_then(|()| Ok(File::open(&self.partial)?.sync_all()?))
             .and_then(|()| Ok(std::fs::rename(&self.partial, &self.path)?))
-            .map_err(|error| format!("cannot write {}: {error}", self.path.display()).into())
+            .map_err(|error| self.failure(&error))
     }
 }
 

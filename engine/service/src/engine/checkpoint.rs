@@ -375,8 +375,10 @@ impl CheckpointLock {
             // If they differ, an engine that ended has removed the file in the meantime.
             if locked_file::is_same(&file, &path) {
                 let process = std::process::id();
-                file.set_len(0).and_then(|()| writeln!(file, "{process}")).map_err(failed)?;
-                return Ok(CheckpointLock { file, path, process });
+                // Removes the file if the disk is full.
+                let mut lock = CheckpointLock { file, path: path.clone(), process };
+                lock.file.set_len(0).and_then(|()| writeln!(lock.file, "{process}")).map_err(failed)?;
+                return Ok(lock);
             }
         }
     }
