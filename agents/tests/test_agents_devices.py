@@ -91,7 +91,7 @@ import torch
 from other_device import NAME, device, register
 from torch import nn
 
-from endless_gym_agents import own
+from endless_gym_agents.common import own
 from endless_gym_agents.memories import MEMORIES
 from endless_gym_agents.memories.sequence_model import Stack
 

@@ -82,7 +82,7 @@ sys.path.append({str(Path(__file__).parent)!r})
 import json
 import other_device
 import test_agents_operations
-from endless_gym_agents import ppo, rollout
+from endless_gym_agents.training import ppo, rollout
 
 other_device.register()
 found = {{}}

@@ -10,6 +10,17 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
+def named(file: Path) -> Iterator[None]:
+    """Add the name of the file to errors that have none, such as those of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename is None:
+            error.filename = str(file)
+        raise
+
+
+@contextlib.contextmanager
 def replacing(file: str | Path) -> Iterator[Path]:
     """Yield the path of a new file in the same folder, which replaces `file` once the block has ended and it is on disk.
 
@@ -28,18 +39,17 @@ def replacing(file: str | Path) -> Iterator[Path]:
     new.unlink(missing_ok=True)
     new.touch(exist_ok=False)
     try:
-        former = file if file.is_file() and not file.is_symlink() else new
-        mode = stat.S_IMODE(former.stat().st_mode)
-        new.chmod(mode | stat.S_IWUSR)
-        yield new
-        _flush(new)
-        new.chmod(mode)
-        new.replace(file)
-    except BaseException as error:
+        with named(file):
+            former = file if file.is_file() and not file.is_symlink() else new
+            mode = stat.S_IMODE(former.stat().st_mode)
+            new.chmod(mode | stat.S_IWUSR)
+            yield new
+            _flush(new)
+            new.chmod(mode)
+            new.replace(file)
+    except BaseException:
         with contextlib.suppress(OSError):
             new.unlink()
-        if isinstance(error, OSError) and error.errno and error.filename is None:
-            error.filename = str(file)  # Errors of a full disk name none.
         raise
     _flush(file.parent)
 

@@ -1,9 +1,9 @@
 """Checkpoints: the state from which a run resumes, and the agent for evaluation.
 
 ```python
-from endless_gym_agents import checkpoint
+import endless_gym_agents
 
-loaded = checkpoint.load("runs/mine")    # the last checkpoint of a run, or a checkpoint file
+loaded = endless_gym_agents.load("runs/mine")    # the last checkpoint of a run, or a checkpoint file
 agent, steps = loaded.agent, loaded.steps
 ```
 """

@@ -78,8 +78,9 @@ class Logger:
         """
         row = metrics | {f"seconds/{name}": value for name, value in seconds.items()}
         numbers = {name: None if math.isnan(value) else value for name, value in row.items()}
-        self._progress.write(f"{json.dumps(numbers)}\n".encode())
-        self._progress.flush()
+        with atomic.named(Path(self._progress.name)):
+            self._progress.write(f"{json.dumps(numbers)}\n".encode())
+            self._progress.flush()
         update, steps = metrics["update"], metrics["steps"]
         for name, value in row.items():
             if name not in ("update", "steps"):
@@ -113,7 +114,8 @@ class Logger:
 
     def sync(self) -> None:
         """Wait until the rows are on disk. A checkpoint must not outlive the rows of its updates when the machine fails."""
-        os.fsync(self._progress.fileno())
+        with atomic.named(Path(self._progress.name)):
+            os.fsync(self._progress.fileno())
 
     def print(self, text: str) -> None:
         """Print a line on the terminal."""

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from endless_gym.printable import printable
+from endless_gym_agents.common import atomic
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.logs import PROGRESS
@@ -104,9 +105,10 @@ def locked(run: Path) -> Iterator[None]:
                 continue  # The process that held the lock has removed the file.
             text = f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n"
             try:
-                file.truncate(0)
-                # Without a buffer, which would be written again on a full disk when the file is closed.
-                os.write(file.fileno(), text.encode())
+                with atomic.named(path):
+                    file.truncate(0)
+                    # Without a buffer, which would be written again on a full disk when the file is closed.
+                    os.write(file.fileno(), text.encode())
                 yield
             finally:
                 path.unlink(missing_ok=True)
