@@ -10,10 +10,8 @@ use serde_json::Value as Json;
 
 use crate::actors;
 use crate::cleanliness;
+use crate::plan::MILLION;
 use crate::scene::{LIMIT, Scene};
-
-/// Moments are in millionths of the time that the undisturbed run takes.
-pub const MILLION: i64 = 1_000_000;
 
 /// A run of a few hundredths of a second.
 const RUN: &str = "MortarMayhem-Grid-v0 --environment.option command_count=[1] --environment.num-envs 4 --threads 1 \

@@ -4,7 +4,6 @@
 use endless_gym_core::random::{Generator, SeedSequence};
 use serde::{Deserialize, Serialize};
 
-use crate::learner::MILLION;
 use crate::shape::Shape;
 
 /// One process of a round.
@@ -128,6 +127,9 @@ pub struct Plan {
 
 /// About how long a process takes to start and connect, in microseconds.
 const START: i64 = 60_000;
+
+/// The time that an undisturbed run of `endless learn` takes.
+pub const MILLION: i64 = 1_000_000;
 
 impl Plan {
     /// Round `number` of a seed.
