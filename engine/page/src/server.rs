@@ -58,6 +58,10 @@ pub struct Port {
 
 impl Port {
     /// Binds the address; port 0 for any free one.
+    ///
+    /// # Errors
+    ///
+    /// The operating system's, such as that the port is taken.
     pub fn bind(address: SocketAddr) -> io::Result<Self> {
         let listener = TcpListener::bind(address)?;
         listener.set_nonblocking(true)?;
@@ -65,6 +69,10 @@ impl Port {
     }
 
     /// Binds a port on 127.0.0.1; 0 for any free one.
+    ///
+    /// # Errors
+    ///
+    /// [`ServerError::Port`] if the port is taken.
     pub fn local(port: u16) -> Result<Self, ServerError> {
         Port::bind((Ipv4Addr::LOCALHOST, port).into()).map_err(|reason| ServerError::Port { port, reason })
     }
@@ -75,6 +83,10 @@ impl Port {
     }
 
     /// Serves in this thread until `stopped` is ready, and then closes open connections.
+    ///
+    /// # Errors
+    ///
+    /// [`ServerError::Server`] if the operating system refuses threads or descriptors.
     pub fn serve(self, router: Router, stopped: impl Future<Output = ()>) -> Result<(), ServerError> {
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(BLOCKING_THREADS).build();
