@@ -99,7 +99,8 @@ def test_a_signal_stops_a_run_after_its_update_with_a_checkpoint(number: signal.
 def test_a_run_killed_at_any_call_that_changes_its_files_continues_with_one_command(tmp_path: Path) -> None:
     """Without hard links, as on some file systems."""
     library, tests = tmp_path / "kill_at.so", Path(__file__).parent
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tests / "kill_at.c", "-ldl"], check=True)
+    source = tests.parents[1] / "tests/kill_at.c"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
     given = {"LD_PRELOAD": str(library), "PYTHONPATH": f"{tests}:{os.environ.get('PYTHONPATH', '')}"}
     done = subprocess.run(
         [sys.executable, tests / "kills.py", tmp_path],

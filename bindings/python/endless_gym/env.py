@@ -160,7 +160,7 @@ class Env(gymnasium.Env[Any, Any]):
             >>> while not terminated:
             ...     observation, reward, terminated, truncated, info = env.step(0)
             >>> reward, info
-            (0.0, {'reward': 0.0, 'length': 10, 'success': 1, 'commands_completed': 1.0})
+            (0.0, {'reward': 0.0, 'length': 10, 'success': 1, 'commands_completed': 1.0, 'task_progress': 0.0})
 
         Raises:
             ResetNeeded: The environment has not been reset.

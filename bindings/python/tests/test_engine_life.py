@@ -12,7 +12,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from support import await_end_of_engines, segments
+from support import await_end_of_engines, segments, stop
 
 import endless_gym
 
@@ -174,7 +174,7 @@ def test_a_signal_handler_closes_environments_that_wait_for_the_engine() -> None
     envs = endless_gym.serve(ID, 1)
     envs.reset()
     process = envs._engine._process
-    os.kill(process.pid, signal.SIGSTOP)
+    stop(process.pid)
     before = signal.signal(signal.SIGALRM, lambda *_: envs.close())
     signal.setitimer(signal.ITIMER_REAL, 0.3)
     try:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import await_end_of_engines, engine_of_program, same, segments
+from support import await_end_of_engines, engine_of_program, same, segments, stop
 
 import endless_gym
 from endless_gym.program import program
@@ -76,7 +76,7 @@ with endless_gym.serve({ID!r}, 4) as envs:
 def test_other_threads_run_while_one_waits() -> None:
     with endless_gym.serve(ID, 4) as envs:
         envs.reset()
-        os.kill(envs._engine.pid, signal.SIGSTOP)
+        stop(envs._engine.pid)
         stepping = threading.Thread(target=envs.step, args=(ACTIONS,))
         stepping.start()
         start = time.monotonic()
@@ -136,7 +136,7 @@ def test_an_interrupted_step_is_played_once() -> None:
         envs.reset()
         twin.reset()
         engine = envs._engine.pid
-        os.kill(engine, signal.SIGSTOP)
+        stop(engine)
         interrupt = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
         interrupt.start()
         with pytest.raises(KeyboardInterrupt):
@@ -223,8 +223,6 @@ def test_package_includes_the_program() -> None:
             assert subprocess.run([*command, *arguments], stdout=full, stderr=subprocess.PIPE).returncode == status
     demo = [*command, "demo", "--seconds", "0.5", "--num-envs", "8"]
     assert subprocess.run(demo, capture_output=True, check=False).returncode == 0
-    table = [sys.executable, "-m", "endless_gym", "--num-envs", "4", "--seconds", "0.01"]
-    assert ID in subprocess.run(table, capture_output=True, text=True, check=True).stdout
 
 
 def test_a_running_engine_without_final_observations() -> None:

@@ -153,7 +153,7 @@ fn a_run_without_a_checkpoint_starts_again_from_its_settings() {
 /// A library to preload, which kills a process at one of its calls that change files.
 fn kill_at(folder: &Folder) -> PathBuf {
     let library = folder.0.join("kill_at.so");
-    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/kill_at.c");
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/kill_at.c");
     let status = Process::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).args([source, "-ldl"]).status();
     assert!(status.unwrap().success());
     library
