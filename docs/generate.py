@@ -221,9 +221,12 @@ def errors(names: str) -> str:
 
 
 def error_types() -> dict[str, dict[str, tuple[str, str]]]:
-    """Message and cause by error type and variant. Errors that show another error's message are left out."""
+    """Message and cause by error type and variant. Errors that show another error's message are left out, and so are those of the
+    learner, whose messages say what to do."""
     types = {}
     for file in sorted((ROOT / "engine").glob("*/src/**/*.rs")):
+        if file.relative_to(ROOT / "engine").parts[0] in ("kernels", "trainer"):
+            continue
         for doc, attributes, kind, name, body in ERROR_TYPE.findall(file.read_text()):
             described = [(doc, attributes, "self", body)] if kind == "struct" else VARIANT.findall(body)
             types[name] = {

@@ -117,7 +117,7 @@ def test_a_run_killed_at_any_call_that_changes_its_files_continues_with_one_comm
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT])
 def test_results_without_space_are_one_error_and_keep_the_former_file(error: int, tmp_path: Path) -> None:
     library, folder, work = tmp_path / "kill_at.so", tmp_path / "results", tmp_path / "work.py"
-    source = Path(__file__).with_name("kill_at.c")
+    source = Path(__file__).parents[2] / "tests/kill_at.c"
     subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
     folder.mkdir()
     work.write_text("""

@@ -78,7 +78,7 @@ def test_task_progress_uses_the_path_length_of_each_seed() -> None:
 )
 def test_labels_match_the_published_results(flags: str, expected: str) -> None:
     assert label(parse(flags.split())) == expected
-    published = json.loads((Path(endless_gym_agents.__file__).parent / "published.json").read_text())
+    published = json.loads((Path(endless_gym_agents.__file__).parent / "evaluation/published.json").read_text())
     names = {name for curves in published["curves"].values() for name in curves}
     assert expected.replace("_learned", "_lr_learned") in names | {"trxl_qprev"}
 

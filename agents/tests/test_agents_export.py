@@ -24,7 +24,7 @@ from endless_gym_agents.training import checkpoint
 
 ID = "MortarMayhem-Grid-v0"
 ROOT = Path(__file__).resolve().parents[2]
-FILES = sorted((ROOT / "engine" / "view" / "page" / "files").glob("*.safetensors"))
+FILES = sorted((ROOT / "engine" / "page" / "files").glob("*.safetensors"))
 
 
 def trained(tmp_path: Path, **changes: Any) -> Path:

@@ -96,7 +96,7 @@ def program(
     def started(name: str, *given: str) -> Iterator["subprocess.Popen[bytes]"]:
         with (tmp_path / "output").open("w") as output:
             process = subprocess.Popen(
-                [python, "-m", f"endless_gym_agents.{name}", *given, *where],
+                [python, "-m", f"endless_gym_agents.paper.{name}", *given, *where],
                 cwd=tmp_path,
                 env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
                 stdout=output,

@@ -191,7 +191,7 @@ def test_no_thread_outlives_the_connection(tmp_path: Path) -> None:
     program.write_text(
         f"""
 from pathlib import Path
-from endless_gym_agents.train import parse, train
+from endless_gym_agents.training.train import parse, train
 
 train(parse({[*ARGUMENTS, "--agent", "gru", "--run", str(tmp_path / "run")]!r}))
 names = [file.read_text() for file in Path("/proc/self/task").glob("*/comm")]

@@ -76,7 +76,7 @@ class Curve:
 
 @cache
 def _published() -> dict[str, Any]:
-    file = resources.files("endless_gym_agents") / "published.json"
+    file = resources.files("endless_gym_agents.evaluation") / "published.json"
     read: dict[str, Any] = json.loads(file.read_text())
     return read
 
