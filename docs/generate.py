@@ -222,7 +222,8 @@ def errors(names: str) -> str:
 
 def error_types() -> dict[str, dict[str, tuple[str, str]]]:
     """Message and cause by error type and variant. Errors that show another error's message are left out, and so are those of the
-    learner, whose messages say what to do."""
+    learner, whose messages say what to do.
+    """
     types = {}
     for file in sorted((ROOT / "engine").glob("*/src/**/*.rs")):
         if file.relative_to(ROOT / "engine").parts[0] in ("kernels", "trainer"):

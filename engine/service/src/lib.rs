@@ -64,7 +64,7 @@
 //! | dead processes fill `/dev/shm`, or their directory was removed | the next process that joins a namespace of the same path removes what no process uses, which it knows from the locks of the prefixes |
 //! | a process is stopped while it holds the namespace's lock | the others wait: a starting engine 30 s, a trainer or observer its timeout but at least 5 s, and up to six times as long while the lock changes hands; after a second they log the holder, and [`ServiceError::NamespaceLocked`] names it |
 //! | two directories have the same path (containers that share `/dev/shm` but not `/tmp`) | they are two namespaces, whose segments have different random prefixes |
-//! | the namespace's directory is removed or replaced | within a second [`Engine::run`] ends with [`ServiceError::RootRemoved`], and `endless serve` starts again in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
+//! | the namespace's directory is removed or replaced | within a second [`EngineHandle::join`] returns [`ServiceError::RootRemoved`], and `endless serve` starts again in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
 //! | another user creates segments with the names of a namespace | a namespace without processes gets another prefix; otherwise the call fails with [`ServiceError::ForeignSegment`]; other users have access to no lasting segment |
 //! | a process forks | only the process that connected counts as alive; a forked child neither keeps it alive nor releases what it holds |
 //! | an engine's files are removed while it starts | it checks after publishing that it can be found, starts again up to twice, and then ends with [`ServiceError::EngineUnreachable`] |
