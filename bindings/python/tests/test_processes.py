@@ -58,6 +58,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 with endless_gym.serve({ID!r}, 4) as envs:
     envs.reset()
     os.kill(envs._engine.pid, signal.SIGSTOP)
+    os.waitid(os.P_PID, envs._engine.pid, os.WSTOPPED)  # It may answer before it stops.
     try:
         print("waiting", flush=True)
         envs.step([[0, 0]] * 4)
