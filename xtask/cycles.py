@@ -24,6 +24,7 @@ CRATES = [
     "engine/cli",
     "engine/core",
     "engine/memory-gym",
+    "engine/page",
     "engine/popgym",
     "engine/service",
     "engine/view",
