@@ -22,7 +22,8 @@ from endless_gym_agents.common.own import MEMORIES
 from endless_gym_agents.common.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
 
 #: The agents of the package. Others are classes of your own; see `Settings.agent`.
-AGENTS = ("gru", "lstm", *MEMORIES, "trxl", "gtrxl", "none", "stack", "position")
+BASELINES = ("none", "stack", "position")
+AGENTS = ("gru", "lstm", *MEMORIES, "trxl", "gtrxl", *BASELINES)
 PresetName = Literal["paper", "old", "overnight", "throughput", "throughput-512", "quick"]
 
 #: Seeds of the training episodes. Evaluation uses seeds from 200,000 on, so its levels are never seen in training.
@@ -87,10 +88,10 @@ class Recurrence:
     embedding: bool = True
     """fully connected layer before the recurrent layers"""
     sequence_length: Positive = 512
-    """length of truncated BPTT in steps; longer segments are cut into sequences that start from stored hidden states"""
+    """length of truncated BPTT in steps; longer segments are cut into sequences that start from stored states"""
     kernels: Literal["auto", "torch"] = "auto"
-    """how the CPU computes these layers while learning. auto: by native kernels where they are faster, that is with
-    `--threads 1`, or 2 and at most 128 units; torch: by PyTorch's operations"""
+    """how the CPU computes these layers while learning. auto: by native kernels where the layer has one; torch: by PyTorch's
+    operations"""
 
 
 @dataclass(frozen=True)
@@ -199,8 +200,8 @@ class Settings:
     """gru, lstm, mingru, lru, mamba2, gated-deltanet, retnet, mlstm, ffm (Fast and Forgetful Memory), shm (Stable Hadamard
     Memory), trxl (Transformer-XL) or gtrxl (gated Transformer-XL); a baseline without memory: none, stack (stacked grey frames)
     or position (encoded step number as an observation); or a memory of your own: module:Class or file.py:Class, a class derived
-    from `endless_gym_agents.memories.sequence_model.SequenceModel`, or one as `endless_gym_agents.memories.recurrent.CellMemory`
-    describes"""
+    from `endless_gym_agents.memories.sequence_model.SequenceModel`, or one as
+    `endless_gym_agents.memories.sequence_model.Cell` describes"""
     agent_option: tuple[str, ...] = ()
     """arguments of the agent's class, each as NAME=VALUE with a JSON value; not for gru, lstm, trxl, gtrxl and the baselines"""
     encoder: str = ""
@@ -222,9 +223,6 @@ class Settings:
     """CPU threads of PyTorch; 0 for PyTorch's default"""
     bind_cores: bool = False
     """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
-    compile: bool = False
-    """compile the network with `torch.compile`; on CUDA in the mode `reduce-overhead`, which replays CUDA graphs. The first
-    updates then take minutes longer"""
     bf16: bool = False
     """bfloat16 autocast for the network; weights and losses stay float32. On the CPU, recurrent agents use it for the encoder and
     the embedding only"""
@@ -349,10 +347,11 @@ class Settings:
                 f"--transformer.width must be a multiple of twice --transformer.heads, got width {transformer.width} and "
                 f"{transformer.heads} heads"
             )
-        if self.agent in ("trxl", "gtrxl") and ppo.steps % min(transformer.sequence_length, ppo.steps):
+        group = "transformer" if self.agent in ("trxl", "gtrxl") else "recurrence"
+        length = getattr(self, group).sequence_length
+        if self.agent not in BASELINES and ppo.steps % min(length, ppo.steps):
             raise ValueError(
-                f"--ppo.steps must be a multiple of --transformer.sequence-length, got {ppo.steps} steps and sequences of "
-                f"{transformer.sequence_length}"
+                f"--ppo.steps must be a multiple of --{group}.sequence-length, got {ppo.steps} steps and sequences of {length}"
             )
         if self.environment.observation == "features" and self.ppo.reconstruction_coefficient:
             raise ValueError(
@@ -498,6 +497,7 @@ def from_dict(values: dict[str, Any]) -> Settings:
         TypeError: An unknown field.
     """
     values = dict(values)
+    values.pop("compile", None)  # a setting of earlier versions
     for part in dataclasses.fields(Settings):
         if dataclasses.is_dataclass(kind := part.default_factory):
             # A run of `endless learn` has only the settings that it uses.

@@ -84,18 +84,16 @@ def test_recurrent_layers_equal_those_of_the_authors(name: str) -> None:
     given = Recurrence(hidden_size=width, layers=layers, residual=residual, sequence_length=length)
     memory = RecurrentMemory("lstm" if name == "lstm" else "gru", x.shape[1], given, CPU)
     transplanted(memory, recorded)
+    tree = {f"{part}{layer}": hidden[i, layer] for i, part in enumerate(memory.model.parts) for layer in range(layers)}
     with torch.no_grad():
-        acted, after = memory.step(
-            memory.embed(x[::length]), RecurrentState(hidden), torch.zeros(sequences, dtype=torch.bool)
-        )
+        acted, after = memory.step(memory.embed(x[::length]), RecurrentState(tree), None)
     assert_close(acted, tensors(recorded["acted"]))
-    assert_close(after, tensors(recorded["after"]).transpose(1, 2))
-    # Packed: step by step.
-    order = torch.arange(len(x)).view(sequences, length).t().flatten()
-    batch_sizes = torch.full((length,), sequences)
-    output = memory(
-        memory.embed(x[order]), RecurrentMinibatch(order, order, batch_sizes, hidden.contiguous(), order < 0)
-    )
+    expected = tensors(recorded["after"]).transpose(1, 2)
+    assert_close(torch.stack([after[name] for name in tree]), expected.flatten(0, 1))
+    # Step by step.
+    order = torch.arange(len(x)).view(sequences, length).t()
+    output = memory(memory.embed(x[order.flatten()]), RecurrentMinibatch(order, order, tree, order < 0))
+    order = order.flatten()
     assert_close(output, tensors(recorded["output"])[order])
     assert_gradients(memory, output, factor[order], recorded)
 

@@ -138,7 +138,7 @@ def test_progress_callback_counts_every_episode(runs: Path) -> None:
 def test_settings_that_do_not_affect_learning_share_an_experiment() -> None:
     given, experiments = settings("gru", env=GRID, seed=1), Experiments()
     apart = {"seed": 2, "run": "b", "preset": "paper", "device": "cuda", "threads": 3, "bind_cores": True, "view": True}
-    apart |= {"compile": True, "on_engine_failure": "fail", "time_limit": 1.0, "wandb": True}
+    apart |= {"on_engine_failure": "fail", "time_limit": 1.0, "wandb": True}
     for name, value in apart.items():
         assert getattr(given, name) != value
         assert experiments.of(replace(given, **{name: value})) is experiments.of(given), name

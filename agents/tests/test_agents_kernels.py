@@ -1,104 +1,137 @@
-"""The layers over packed sequences, native and not, have the same outputs and gradients as PyTorch's layers."""
+"""GRU and LSTM layers, native and fused, and minGRU have the outputs and gradients of PyTorch's operations, with resets."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
-from torch.nn.utils.rnn import PackedSequence
+from torch import Tensor
 
 from endless_gym import _native
-from endless_gym_agents.memories.kernels import KernelGRU, KernelMinGRU
-from endless_gym_agents.memories.recurrence import packed_layers
+from endless_gym_agents.memories import fused
+from endless_gym_agents.memories.gated import GRU, LSTM
+from endless_gym_agents.memories.mingru import MinGRU
+from endless_gym_agents.memories.sequence_model import SequenceModel
+
+#: Steps, sequences and hidden size; sequences are divided among threads.
+SHAPES = [(1, 1, 1), (1, 3, 33), (32, 8, 128), (5, 9, 7), (29, 1, 12), (3, 17, 40)]
 
 
-def batches() -> list[tuple[int, list[int]]]:
-    """Hidden sizes and numbers of sequences per step; the shapes are random, and some sequences have one step."""
-    draws = np.random.default_rng(1)
-    shapes = [(1, [1]), (33, [1]), (7, [3, 1]), (128, [8] * 32)]
-    for _ in range(12):
-        lengths = [1, *draws.integers(1, 30, draws.integers(1, 20)).tolist()]
-        sizes = [sum(length > t for length in lengths) for t in range(max(lengths))]
-        shapes.append((int(draws.integers(1, 70)), sizes))
-    return shapes
+class Cells:
+    """What PyTorch's fused cells compute on CUDA; the workspaces hold what the backward pass needs."""
+
+    @staticmethod
+    def _thnn_fused_gru_cell(inputs: Tensor, gates: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        x, h = inputs.chunk(3, 1), gates.chunk(3, 1)
+        reset, update = (x[0] + h[0]).sigmoid(), (x[1] + h[1]).sigmoid()
+        candidate = (x[2] + reset * h[2]).tanh()
+        return candidate + update * (hidden - candidate), torch.cat([reset, update, candidate, hidden, h[2]], 1)
+
+    @staticmethod
+    def _thnn_fused_gru_cell_backward(grad: Tensor, workspace: Tensor, _: bool) -> tuple[Tensor | None, ...]:
+        reset, update, candidate, hidden, h = workspace.chunk(5, 1)
+        of_candidate = grad * (1 - update) * (1 - candidate.square())
+        of_update = grad * (hidden - candidate) * update * (1 - update)
+        of_reset = of_candidate * h * reset * (1 - reset)
+        inputs, gates = ([of_reset, of_update, last] for last in (of_candidate, of_candidate * reset))
+        return torch.cat(inputs, 1), torch.cat(gates, 1), grad * update, None, None
+
+    @staticmethod
+    def _thnn_fused_lstm_cell(inputs: Tensor, gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        entry, forget, candidate, exit_ = (inputs + gates).chunk(4, 1)
+        entry, forget, candidate, exit_ = entry.sigmoid(), forget.sigmoid(), candidate.tanh(), exit_.sigmoid()
+        cell = forget * cell + entry * candidate
+        return exit_ * cell.tanh(), cell, torch.cat([entry, forget, candidate, exit_], 1)
+
+    @staticmethod
+    def _thnn_fused_lstm_cell_backward_impl(
+        grad: Tensor, grad_cell: Tensor, before: Tensor, cell: Tensor, workspace: Tensor, _: bool
+    ) -> tuple[Tensor, Tensor, None]:
+        entry, forget, candidate, exit_ = workspace.chunk(4, 1)
+        of_cell = grad_cell + grad * exit_ * (1 - cell.tanh().square())
+        of_gates = [
+            of_cell * candidate * entry * (1 - entry),
+            of_cell * before * forget * (1 - forget),
+            of_cell * entry * (1 - candidate.square()),
+            grad * cell.tanh() * exit_ * (1 - exit_),
+        ]
+        return torch.cat(of_gates, 1), of_cell * forget, None
 
 
-def min_gru(inputs: Tensor, hidden: Tensor, sizes: list[int]) -> Tensor:
-    """The equations of minGRU in PyTorch."""
-    outputs = []
-    for x in inputs.split(sizes):
-        z, candidate = x[:, : hidden.shape[1]].sigmoid(), x[:, hidden.shape[1] :]
-        hidden = (1 - z) * hidden[: len(x)] + z * candidate
-        outputs.append(hidden)
-    return torch.cat(outputs)
+def fused_layers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute the layers as on CUDA, but for the fused cells themselves."""
+    monkeypatch.setattr(fused, "aten", Cells)
+    monkeypatch.setattr("endless_gym_agents.memories.gated.KernelGRU", fused.FusedGRU)
+    monkeypatch.setattr("endless_gym_agents.memories.gated.KernelLSTM", fused.FusedLSTM)
 
 
-def check(named: dict[str, Tensor], output: Tensor, expected: Tensor) -> None:
-    """Compare outputs, and the gradients of all tensors for a random gradient of the outputs."""
-    torch.testing.assert_close(output, expected, rtol=1e-5, atol=1e-5)
-    weight = torch.randn_like(output) / len(output) ** 0.5
-    gradients, references = (
-        torch.autograd.grad((result * weight).sum(), list(named.values())) for result in (output, expected)
-    )
-    for name, gradient, reference in zip(named, gradients, references, strict=True):
-        assert reference.abs().max() > 0, name
-        torch.testing.assert_close(
-            gradient, reference, rtol=1e-5, atol=1e-5, msg=lambda text, name=name: f"{name}: {text}"
-        )
+def results(
+    layers: SequenceModel, sequence: Any, x: Tensor, state: dict[str, Tensor], resets: Tensor
+) -> dict[str, Tensor]:
+    """Outputs, the state after the last step, and the gradients of everything for a random gradient of the outputs."""
+    x, state = x.clone().requires_grad_(), {name: part.clone().requires_grad_() for name, part in state.items()}
+    outputs, after = sequence(layers, x, state, resets)
+    named = {"x": x, **state, **dict(layers.named_parameters())}
+    weight = torch.randn(outputs.shape, generator=torch.Generator().manual_seed(2)) / outputs.numel() ** 0.5
+    gradients = torch.autograd.grad((outputs * weight).sum(), list(named.values()), retain_graph=True)
+    again = torch.autograd.grad((outputs * weight).sum(), list(named.values()))
+    assert all(map(torch.equal, gradients, again))
+    after = {f"{name} after": part.detach() for name, part in after.items()}
+    return {"outputs": outputs.detach(), **after, **dict(zip(named, gradients, strict=True))}
 
 
-@pytest.mark.parametrize("shape", batches(), ids=str)
-@pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
-@pytest.mark.parametrize("native", [False, True])
-def test_layers_equal_those_of_pytorch(
-    native: bool, kind: type[nn.GRU] | type[nn.LSTM], shape: tuple[int, list[int]]
+@pytest.mark.parametrize("resetting", [False, True])
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("kind", ["gru", "lstm", "mingru", "fused gru", "fused lstm"])
+def test_layers_equal_the_loop_over_their_steps(
+    kind: str, shape: tuple[int, int, int], resetting: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    width, sizes = shape
+    steps, sequences, width = shape
     torch.manual_seed(1)
-    layers = kind(5, width, num_layers=2)
-    x = torch.randn(sum(sizes), 5, requires_grad=True)
-    hidden = torch.randn(2 if kind is nn.LSTM else 1, 2, sizes[0], width)
-    expected, _ = layers(PackedSequence(x, torch.tensor(sizes)), hidden[0] if kind is nn.GRU else tuple(hidden))
-    output = packed_layers(x, layers.all_weights, hidden, sizes, native)
-    check({"x": x, **dict(layers.named_parameters())}, output, expected.data)
+    if "fused" in kind:
+        fused_layers(monkeypatch)
+    layers = MinGRU(5, width) if kind == "mingru" else {"gru": GRU, "lstm": LSTM}[kind.split()[-1]](5, width, 2)
+    given = (
+        torch.randn(steps, sequences, 5),
+        {name: torch.randn(sequences, *shape) for name, shape in layers.state_shapes.items()},
+        (torch.rand(steps, sequences) < 0.3) & resetting,
+    )
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    expected = results(layers, SequenceModel.sequence, *given)
+    torch.testing.assert_close(results(layers, type(layers).sequence, *given), expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("shape", batches(), ids=str)
-def test_min_gru_equals_its_equations(shape: tuple[int, list[int]]) -> None:
-    width, sizes = shape
-    torch.manual_seed(1)
-    hidden = torch.randn(sizes[0], width, requires_grad=True)
-    inputs = torch.randn(sum(sizes), 2 * width, requires_grad=True)
-    output, expected = KernelMinGRU.apply(inputs, hidden, sizes), min_gru(inputs, hidden, sizes)
-    check({"inputs": inputs, "hidden": hidden}, output, expected)
-
-
-def test_gradients_are_the_same_when_they_are_computed_twice() -> None:
-    inputs = torch.randn(5, 6, requires_grad=True)
-    output = KernelGRU.apply(inputs, torch.randn(6, 2), torch.randn(6), torch.randn(3, 2), [3, 2]).sum()
-    first, second = (torch.autograd.grad(output, inputs, retain_graph=True)[0] for _ in range(2))
-    torch.testing.assert_close(first, second, rtol=0, atol=0)
-
-
-def test_arrays_of_other_shapes_or_sizes_are_refused() -> None:
-    def forward(
-        inputs: int = 5, saved: int = 10, sizes: tuple[int, ...] = (3, 2), resets: tuple[bool, ...] = ()
-    ) -> None:
-        shapes = (inputs, 6), (6, 2), (6,), (3, 2), (5, saved), (5, 2)
+def test_arrays_of_other_shapes_are_refused() -> None:
+    def forward(columns: int = 6, saved: int = 10, resets: int = 6) -> None:
+        shapes = (6, columns), (6, 2), (6,), (3, 2), (6, saved), (6, 2)
         arrays = [np.zeros(shape, np.float32) for shape in shapes]
-        _native.gru_forward(*arrays[:4], sizes, resets, *arrays[4:])
+        _native.gru_forward(*arrays[:4], np.zeros(resets, bool), *arrays[4:])
 
     forward()
-    with pytest.raises(ValueError, match=r"inputs must have the shape \[5, 6\], got \[4, 6\]"):
-        forward(inputs=4)
-    with pytest.raises(ValueError, match=r"saved must have the shape \[5, 10\], got \[5, 9\]"):
+    with pytest.raises(ValueError, match=r"inputs must have the shape \[6, 6\], got \[6, 5\]"):
+        forward(columns=5)
+    with pytest.raises(ValueError, match=r"saved must have the shape \[6, 10\], got \[6, 9\]"):
         forward(saved=9)
-    with pytest.raises(ValueError, match="the sizes must not increase"):
-        forward(sizes=(2, 3))
-    with pytest.raises(ValueError, match="with 4 sequences, got"):
-        forward(sizes=(4, 1))
-    with pytest.raises(ValueError, match="one reset for each of 5 steps or none, got 1"):
-        forward(resets=(True,))
+    with pytest.raises(ValueError, match="reset"):
+        forward(resets=5)
     with pytest.raises(TypeError, match="contiguous"):
-        strided = np.zeros((5, 12), np.float32)[:, ::2]
-        others = [np.zeros(shape, np.float32) for shape in ((6, 2), (6,), (3, 2), (5, 10), (5, 2))]
-        _native.gru_forward(strided, *others[:3], (3, 2), (), *others[3:])
+        strided = np.zeros((6, 12), np.float32)[:, ::2]
+        others = [np.zeros(shape, np.float32) for shape in ((6, 2), (6,), (3, 2), (6, 10), (6, 2))]
+        _native.gru_forward(strided, *others[:3], np.zeros(6, bool), *others[3:])
+
+
+def test_pytorch_has_the_fused_cells_as_expected() -> None:
+    """They run on CUDA only; a version of PyTorch that changes them fails here."""
+    found = [str(getattr(torch.ops.aten, name).default._schema) for name in vars(Cells) if name.startswith("_thnn")]
+    assert found == [
+        "aten::_thnn_fused_gru_cell(Tensor input_gates, Tensor hidden_gates, Tensor hx, Tensor? input_bias=None, "
+        "Tensor? hidden_bias=None) -> (Tensor, Tensor)",
+        "aten::_thnn_fused_gru_cell_backward(Tensor grad_hy, Tensor workspace, bool has_bias) -> "
+        "(Tensor, Tensor, Tensor, Tensor, Tensor)",
+        "aten::_thnn_fused_lstm_cell(Tensor input_gates, Tensor hidden_gates, Tensor cx, Tensor? input_bias=None, "
+        "Tensor? hidden_bias=None) -> (Tensor, Tensor, Tensor)",
+        "aten::_thnn_fused_lstm_cell_backward_impl(Tensor? grad_hy, Tensor? grad_cy, Tensor cx, Tensor cy, "
+        "Tensor workspace, bool has_bias) -> (Tensor, Tensor, Tensor)",
+    ]

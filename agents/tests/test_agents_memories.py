@@ -52,7 +52,7 @@ def test_the_programs_take_a_memory(
         return main()
 
     small = ["--preset", "quick", "--threads", "1", "--environment.num-threads", "1", "--environment.num-envs", "4"]
-    small += ["--ppo.steps", "32", "--recurrence.hidden-size", "64", "--recurrence.sequence-length", "12"]
+    small += ["--ppo.steps", "32", "--recurrence.hidden-size", "64", "--recurrence.sequence-length", "16"]
     env = ["--env", "Endless-MysteryPath-v0", "--agent", "retnet"]
     assert run(training.main, *env, *small, "--recurrence.match-gru", "--ppo.updates", "2", "--run", "runs/one") == 0
     assert run(training.main, "--resume", "runs/one", "--ppo.updates", "4") == 0

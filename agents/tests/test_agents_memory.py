@@ -9,8 +9,6 @@ from agents_helpers import BRANCHES, ends, loss_of, make, observations, play, se
 
 from endless_gym_agents.agent.agent import Agent, AgentMemory
 from endless_gym_agents.agent.encoders import FRAME
-from endless_gym_agents.memories.memory import balanced_split
-from endless_gym_agents.memories.recurrent import RecurrentMemory, RecurrentMinibatch
 from endless_gym_agents.memories.transformer import Block, TransformerMemory
 from endless_gym_agents.settings import PRESETS, Recurrence
 from endless_gym_agents.training.rollout import Segment
@@ -22,11 +20,13 @@ KINDS = {
     "position": ("position", {}),
     "stack": ("stack", {}),
     "gru": ("gru", {}),
-    "gru, two layers, residual": ("gru", {"recurrence": Recurrence(16, layers=2, residual=True, sequence_length=5)}),
+    "gru, two layers, residual": ("gru", {"recurrence": Recurrence(16, layers=2, residual=True, sequence_length=6)}),
+    "gru, PyTorch's operations": ("gru", {"recurrence": Recurrence(16, sequence_length=8, kernels="torch")}),
     "lstm": ("lstm", {}),
+    "lstm, two layers": ("lstm", {"recurrence": Recurrence(16, layers=2, sequence_length=8)}),
     "lstm without embedding": ("lstm", {"recurrence": Recurrence(16, embedding=False, sequence_length=24)}),
     "mingru": ("mingru", {}),
-    "mingru, two layers, uneven sequences": ("mingru", {"recurrence": Recurrence(16, layers=2, sequence_length=7)}),
+    "mingru, two layers": ("mingru", {"recurrence": Recurrence(16, layers=2, sequence_length=8)}),
     "mingru, PyTorch's operations": ("mingru", {"recurrence": Recurrence(16, sequence_length=8, kernels="torch")}),
     "trxl": ("trxl", {}),
     "trxl, full heads": ("trxl", transformer(shared_heads=False)),
@@ -294,26 +294,6 @@ def test_kv_cache_is_recomputed_when_a_segment_begins() -> None:
     assert_close(output.value, value.flatten()[minibatch.indices])
 
 
-@pytest.mark.slow
-def test_compiled_agent_has_the_same_outputs() -> None:
-    agent, observed, done = make("trxl"), observations(STEPS, ENVS), ends(STEPS, ENVS)
-    _, action, _, value = play(agent, agent.initial_memory(ENVS), observed, done)
-    parameters = agent.state_dict().keys()
-    agent.compile_parts()
-    _, again, _, compiled = play(agent, agent.initial_memory(ENVS), observed, done)
-    assert torch.equal(action, again)
-    assert_close(compiled, value)
-    assert agent.state_dict().keys() == parameters
-
-
-def test_balanced_split_makes_parts_of_similar_size() -> None:
-    sizes = [1, 30, 5, 5, 9, 2, 2, 2, 8, 8, 8, 20]
-    parts = balanced_split(sizes, 4, torch.Generator().manual_seed(1))
-    assert sorted(torch.cat(parts).tolist()) == list(range(len(sizes)))
-    assert all(10 <= sum(sizes[i] for i in part) <= 40 for part in parts)
-    assert len(balanced_split([1], 4, torch.Generator())) == 1
-
-
 def test_stack_holds_the_last_grey_frames_of_an_episode() -> None:
     agent = Agent(PRESETS["paper"].__class__(agent="stack"), {"visual_observation": (84, 84, 3)}, BRANCHES)
     memory = agent.initial_memory(2)
@@ -352,17 +332,3 @@ def _recording(apply, seen):
         return result
 
     return recorded
-
-
-@pytest.mark.parametrize("kind", ["gru", "lstm"])
-def test_the_setting_selects_the_native_kernels(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    names, indices, sizes = [], torch.arange(3), torch.tensor([2, 1])
-    for kernels in ("auto", "torch"):
-        memory = RecurrentMemory(kind, 16, Recurrence(16, kernels=kernels), torch.device("cpu"))
-        hidden = torch.zeros(memory.parts, 1, 2, 16)
-        output = memory(
-            torch.randn(3, 16), RecurrentMinibatch(indices, indices, sizes, hidden, torch.zeros(3, dtype=torch.bool))
-        )
-        names.append(type(output.grad_fn).__name__)
-    assert names == [f"Kernel{kind.upper()}Backward", f"Packed{kind.upper()}Backward"]

@@ -24,8 +24,8 @@ STEPS, GROUPS = 16, 2
 #: Transformer-XL has two blocks, and the actions two branches. A change that raises a budget must say why.
 BUDGETS = {
     "none": (14, 200),
-    "gru": (29, 345),
-    "lstm": (32, 385),
+    "gru": (29, 250),
+    "lstm": (30, 255),
     # The normalisation of the tokens is folded into the projections: more operations, but none of the size of the tokens.
     "trxl": (50, 325),
     "trxl, single steps": (50, 400),
@@ -114,5 +114,5 @@ for agent in ("gru", "trxl", "stack"):
         assert found["collect"] == {"copy_": STEPS * GROUPS}, line
         # Each group's observation, including the last, is uploaded once; rewards and ends of episodes are uploaded together.
         assert found["uploads"] == [[[2, 4], STEPS * GROUPS], [[4, 17], (STEPS + 1) * GROUPS]], line
-        # The reset mask and the metrics; the Transformer-XL also needs the length of the longest episode.
-        assert sum(found["learn"].values()) <= 2 + 1, line
+        # The metrics.
+        assert sum(found["learn"].values()) == 1, line

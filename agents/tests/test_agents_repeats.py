@@ -24,9 +24,9 @@ from endless_gym_agents.training.rollout import Segment
 ENVS, STEPS = 4, 12
 
 
-def small(agent: str = "gru", observation: str = "rgb", compile: bool = False, **ppo: float) -> Settings:
+def small(agent: str = "gru", observation: str = "rgb", **ppo: float) -> Settings:
     environment = {"num_envs": ENVS, "groups": 2, "num_threads": 1, "observation": observation}
-    given = settings(agent, env="MysteryPath-Grid-v0", threads=1, compile=compile, environment=environment)
+    given = settings(agent, env="MysteryPath-Grid-v0", threads=1, environment=environment)
     return changed(given, ppo={"steps": STEPS, "minibatches": 2, **ppo})
 
 
@@ -132,9 +132,9 @@ def test_losses_and_gradients_equal_those_of_encoding_each_frame(agent: str) -> 
                 torch.testing.assert_close(gradients[name], gradient, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("given", [small(observation="features"), small("stack"), small(compile=True)])
+@pytest.mark.parametrize("given", [small(observation="features"), small("stack")])
 def test_other_observations_are_encoded_one_by_one(given: Settings) -> None:
-    """Features, stacked frames, and frames for a compiled encoder, which would be recompiled for each number of frames."""
+    """Features and stacked frames."""
     with collecting(given) as collector:
         segment, _ = collector.collect(Clock())
     assert segment.first_occurrence is None

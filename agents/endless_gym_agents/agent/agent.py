@@ -50,8 +50,7 @@ from endless_gym_agents.common import own
 from endless_gym_agents.environments import wrappers
 from endless_gym_agents.memories.layers import linear_relu, orthogonal
 from endless_gym_agents.memories.memory import AnyMemory, MemoryState, Minibatch, NoMemory
-from endless_gym_agents.memories.recurrent import CellMemory, RecurrentMemory, SequenceMemory
-from endless_gym_agents.memories.sequence_model import SequenceModel
+from endless_gym_agents.memories.recurrent import RecurrentMemory
 from endless_gym_agents.memories.transformer import TransformerMemory
 from endless_gym_agents.settings import Settings
 
@@ -209,11 +208,7 @@ class Agent(nn.Module):
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
         elif settings.agent_class:
             layer = own.load("--agent", settings.agent_class, nn.Module)
-            arguments = self.encoder.width, recurrence, settings.agent_options(), self.device
-            if issubclass(layer, SequenceModel):
-                self.memory = SequenceMemory(layer, *arguments)
-            else:
-                self.memory = CellMemory(layer, *arguments)
+            self.memory = RecurrentMemory(layer, self.encoder.width, recurrence, self.device, settings.agent_options())
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
         has_memory = not isinstance(self.memory, NoMemory)
@@ -246,14 +241,6 @@ class Agent(nn.Module):
     def num_parameters(self) -> int:
         """Number of trainable parameters."""
         return sum(parameter.numel() for parameter in self.parameters())
-
-    def compile_parts(self) -> None:
-        """Apply `torch.compile` to the submodules whose input shapes are constant or nearly so; on CUDA, as CUDA graphs."""
-        blocks = self.memory.blocks if isinstance(self.memory, TransformerMemory) else []
-        heads = (self.policy, self.value, self.reconstruction, self.ground_truth)
-        for part in (self.encoder, self.body, *heads, *blocks):
-            if part is not None:
-                part.compile(mode="reduce-overhead" if self.device.type == "cuda" else None)
 
     def initial_memory(self, num_envs: int) -> AgentMemory:
         """A new memory for `num_envs` environments, all at the start of an episode."""

@@ -46,7 +46,7 @@ class AtariEncoder(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Encode frames, uint8 (n, 84, 84, channels), as float (n, 3136)."""
-        if frames.device.type == "cpu" and len(frames) > FRAMES_PER_CHUNK and not torch.compiler.is_compiling():
+        if frames.device.type == "cpu" and len(frames) > FRAMES_PER_CHUNK:
             return torch.cat([self(chunk) for chunk in frames.split(FRAMES_PER_CHUNK)])
         # The permuted view already has PyTorch's channels_last memory format; the conversion is the only copy, and bfloat16 holds
         # every byte exactly. Dividing the weights of the first convolution by 255 costs less than dividing the frames.

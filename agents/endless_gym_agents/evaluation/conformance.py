@@ -127,7 +127,7 @@ def play(memory: AnyMemory, x: Tensor, resets: Tensor, segment: bool = True) -> 
 
 def learn(memory: AnyMemory, x: Tensor, played: Played) -> Tensor:
     """The outputs that learning computes for steps that were played, float32 (T, N, width)."""
-    (minibatch,) = memory.minibatches([played.state], played.resets.cpu(), 1, torch.Generator().manual_seed(3))
+    (minibatch,) = memory.minibatches([played.state], played.resets, 1, torch.Generator().manual_seed(3))
     outputs = memory(x.flatten(0, 1).index_select(0, minibatch.indices), minibatch)
     ordered: Tensor = outputs.index_select(0, minibatch.indices.argsort()).unflatten(0, x.shape[:2])
     return ordered
@@ -245,7 +245,7 @@ def _finite(memory: AnyMemory, steps: int, device: torch.device) -> Result:
     if isinstance(memory, RecurrentMemory):
         # A sequence of all steps needs only the state before them.
         assert isinstance(played.state, RecurrentState)
-        played.state.stored = [played.state.hidden]
+        played.state.stored = [played.state.tree]
         outputs = learn(memory, x, Played(played.state, resets, x))
         (gradient,) = torch.autograd.grad(outputs.square().mean(), x)
         finite = bool(gradient.isfinite().all())

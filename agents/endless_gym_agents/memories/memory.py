@@ -125,7 +125,7 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
 
         Args:
             states: The state of each group of environments after the segment, in the order of their columns in the segment.
-            reset_mask: Whether each step is the first of an episode, bool (T, N), on the CPU; with the columns of all ranks.
+            reset_mask: Whether each step is the first of an episode, bool (T, N), with the columns of all ranks.
             num_minibatches: Number of minibatches per epoch; there are fewer if the segment has fewer sequences.
             generator: Generator of the shuffle, on the CPU; in the same state on every rank.
             own: The columns of this rank's environments; `None` for all.
@@ -149,28 +149,20 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
 AnyMemory: TypeAlias = Memory[Any, Any, Any]
 
 
-def balanced_split(sizes: Sequence[int], num_parts: int, generator: torch.Generator) -> list[Tensor]:
-    """Shuffle items and split them into parts of about the same total size.
+def shuffled(items: int, num_parts: int, epochs: int, generator: torch.Generator) -> list[Tensor]:
+    """Shuffle items and divide them into parts of equal size, for each epoch in turn.
 
     Args:
-        sizes: Size of each item, 1 or more.
-        num_parts: Number of parts.
+        items: Number of items.
+        num_parts: Number of parts of an epoch; the sizes of parts differ by 1 if they do not divide the items.
+        epochs: Number of epochs.
         generator: Generator of the shuffle, on the CPU.
 
     Returns:
         The indices of the items in each part, int64 on the CPU. No part is empty: with too few items there are fewer parts.
     """
-    order = torch.randperm(len(sizes), generator=generator)
-    # An item belongs to the part that contains the middle of the item's interval on the cumulative sum of the shuffled sizes.
-    size = torch.tensor(sizes, dtype=torch.float64)[order]
-    middle = size.cumsum(0) - size / 2
-    part = (middle * num_parts / size.sum()).long()
-    return [order[part == number] for number in range(num_parts) if bool((part == number).any())]
-
-
-def shuffled(sizes: Sequence[int], num_parts: int, epochs: int, generator: torch.Generator) -> list[Tensor]:
-    """The parts from `balanced_split` for each epoch in turn; arguments as there."""
-    return [part for _ in range(epochs) for part in balanced_split(sizes, num_parts, generator)]
+    permutations = (torch.randperm(items, generator=generator) for _ in range(epochs))
+    return [part for order in permutations for part in order.tensor_split(min(num_parts, items))]
 
 
 def is_own(envs: Tensor, own: range) -> Tensor:
@@ -218,9 +210,7 @@ class NoMemory(Memory[MemoryState, None, Minibatch]):
                 indices = here // envs * len(own) + here % envs - own.start
             return Minibatch(indices.to(self.device), everywhere.to(self.device))
 
-        permutations = [torch.randperm(reset_mask.numel(), generator=generator) for _ in range(epochs)]
-        parts = [part for permutation in permutations for part in permutation.chunk(num_minibatches)]
-        return Minibatches(parts, minibatch)
+        return Minibatches(shuffled(reset_mask.numel(), num_minibatches, epochs, generator), minibatch)
 
     def forward(self, x: Tensor, minibatch: Minibatch) -> Tensor:
         return x

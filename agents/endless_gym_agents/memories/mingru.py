@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from endless_gym_agents.memories.kernels import KernelMinGRU, kernels_are_faster
+from endless_gym_agents.memories.kernels import KernelMinGRU
 from endless_gym_agents.memories.scans import linear_scan
 from endless_gym_agents.memories.sequence_model import SequenceModel, State
 
@@ -39,9 +39,8 @@ class MinGRU(SequenceModel):
 
     def sequence(self, x: Tensor, state: State, resets: Tensor) -> tuple[Tensor, State]:
         projected = self.projection(x)
-        if self.native and x.device.type == "cpu" and kernels_are_faster(self.width):
-            flat, sizes = projected.flatten(0, 1), [x.shape[1]] * len(x)
-            h = KernelMinGRU.apply(flat, state["h"], sizes, resets.flatten().tolist()).view(*resets.shape, -1)
+        if self.native and x.device.type == "cpu" and x.dtype == torch.float32:
+            h: Tensor = KernelMinGRU.apply(projected, state["h"], resets)
         else:
             z, candidate = projected.chunk(2, dim=-1)
             z = z.sigmoid()

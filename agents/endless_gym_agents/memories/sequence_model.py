@@ -63,6 +63,27 @@ class SequenceModel(nn.Module, ABC):
         return torch.stack(outputs), state
 
 
+class Cell(SequenceModel):
+    """A layer around a cell of your own: a `torch.nn.Module` that computes one step.
+
+    The cell is made by `Class(input_width, hidden_size, **options)`, with `--recurrence.hidden-size` and `--agent-option`. Its
+    `forward(x, state)` takes inputs float32 (B, input width) and states float32 (B, state width), and returns the outputs
+    (B, width) and the next states. Its attributes `width` and `state_width` are the hidden size by default. An episode starts
+    with the state 0.
+    """
+
+    def __init__(self, cell: nn.Module, hidden_size: int) -> None:
+        """Wrap a cell that was made with `hidden_size`."""
+        super().__init__()
+        self.cell = cell
+        self.width = int(getattr(cell, "width", hidden_size))
+        self.state_shapes = {"state": (int(getattr(cell, "state_width", hidden_size)),)}
+
+    def step(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        y, after = self.cell(x, state["state"])
+        return y, {"state": after}
+
+
 class Stack(SequenceModel):
     """Layers of one kind, one after another. Residual layers have a normalised input, and so has what follows the last one."""
 

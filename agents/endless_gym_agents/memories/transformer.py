@@ -412,7 +412,7 @@ TransformerUpdate: TypeAlias = tuple[list[Tensor], Tensor]
 
 @dataclass
 class TransformerMinibatch(Minibatch):
-    """Sequences of C steps each, with the P steps before them: `window - 1`, or fewer if all episodes are shorter.
+    """Sequences of C steps each, with the P steps before them: `window - 1`, or on the CPU fewer if all episodes are shorter.
 
     Attributes:
         tokens: The cached inputs of each block, float (layers, sequences, P + C, width); with positions added, normalised and in
@@ -482,8 +482,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         self.acting_fusion: Affine | None = None
         #: See `ring_ages`.
         self.ages = ring_ages(settings.window, device)
-        #: Whether attention while acting spans only the longest current episode. On the CPU, the largest position is known
-        #: without waiting for a device.
+        #: Whether attention spans only the longest episode, whose length is known on the CPU without waiting for a device.
         self.spans = device.type == "cpu"
         self._attended, self._masked = torch.zeros((), device=device), torch.full((), MASKED, device=device)
 
@@ -553,8 +552,9 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         steps, envs = reset_mask.shape
         own = range(envs) if own is None else own
         length = min(self.settings.sequence_length, steps)
-        longest = torch.stack([state.position[:, self.past :].max() for state in states]).max()
-        past = max(1, min(self.past, int(longest)))
+        past = self.past
+        if self.spans:
+            past = max(1, min(past, max(int(state.position[:, past:].max()) for state in states)))
         # Columns that no query attends to are skipped. Then column c is step c - past.
         skipped, sequences = self.past - past, steps // length
         tokens = torch.cat([self._tokens(state, skipped) for state in states], dim=1)
@@ -586,7 +586,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
                 made.previous = previous[chosen.to(self.device)]
             return made
 
-        split = shuffled([length] * (envs * sequences), num_minibatches, epochs, generator)
+        split = shuffled(envs * sequences, num_minibatches, epochs, generator)
         return Minibatches(split, minibatch)
 
     def _sequences(self, tokens: Tensor, position: Tensor, past: int, steps: int, length: int) -> MakeMinibatch:

@@ -133,7 +133,7 @@ def learn(
     )
     returns, flat = (own_advantages + segment.value).flatten(), segment.flat()
     # Gather a few numbers per step, so that every rank has those of all environments.
-    reset_mask, values = ranks.columns(segment.reset_mask).cpu(), ranks.columns(segment.value).flatten()
+    reset_mask, values = ranks.columns(segment.reset_mask), ranks.columns(segment.value).flatten()
     advantages = ranks.columns(own_advantages).flatten()
     own = ranks.share(reset_mask.shape[1])
     metrics = {

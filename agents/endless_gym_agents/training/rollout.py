@@ -146,8 +146,7 @@ class RolloutCollector:
             self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
         are_frames = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
         self._frames: EmbeddedFrames | None = None
-        # `torch.compile` would recompile the encoder for each number of frames.
-        if are_frames and device.type == "cpu" and not agent.settings.compile:
+        if are_frames and device.type == "cpu":
             self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
         self._parts = [self._columns(self._slice(group)) for group in range(groups)]
         self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]

@@ -110,8 +110,6 @@ def train_rank(
     ppo, started, stop = settings.ppo, time.monotonic(), Interrupt(ranks)
     with stop, Environments(settings, episode_options, ranks, pin_memory=device.type != "cpu") as environments:
         agent = make_agent(settings, environments.spec, device)
-        if settings.compile:
-            agent.compile_parts()
         started_from = checkpoint.start_from(agent, settings.init_from) if settings.init_from and not resumed else ""
         optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"], ranks)

@@ -119,14 +119,14 @@ def specs() -> str: ...
 
 # The kernels of `endless-gym-kernels`: contiguous float32 arrays, of which the last ones are overwritten, as that crate says.
 Numbers = NDArray[np.float32]
+Flags = NDArray[np.bool_]
 
 def gru_forward(
     inputs: Numbers,
     weight: Numbers,
     bias: Numbers,
     state: Numbers,
-    sizes: Sequence[int],
-    resets: Sequence[bool],
+    resets: Flags,
     saved: Numbers,
     outputs: Numbers,
 ) -> None: ...
@@ -134,8 +134,7 @@ def gru_backward(
     weight: Numbers,
     saved: Numbers,
     grad_outputs: Numbers,
-    sizes: Sequence[int],
-    resets: Sequence[bool],
+    resets: Flags,
     grad_inputs: Numbers,
     grad_weight: Numbers,
     grad_bias: Numbers,
@@ -146,8 +145,7 @@ def lstm_forward(
     weight: Numbers,
     hidden: Numbers,
     cell: Numbers,
-    sizes: Sequence[int],
-    resets: Sequence[bool],
+    resets: Flags,
     saved: Numbers,
     outputs: Numbers,
     cells: Numbers,
@@ -156,22 +154,18 @@ def lstm_backward(
     weight: Numbers,
     saved: Numbers,
     grad_outputs: Numbers,
-    sizes: Sequence[int],
-    resets: Sequence[bool],
+    resets: Flags,
     grad_inputs: Numbers,
     grad_weight: Numbers,
     grad_hidden: Numbers,
     grad_cell: Numbers,
 ) -> None: ...
-def mingru_forward(
-    inputs: Numbers, state: Numbers, sizes: Sequence[int], resets: Sequence[bool], saved: Numbers, outputs: Numbers
-) -> None: ...
+def mingru_forward(inputs: Numbers, state: Numbers, resets: Flags, saved: Numbers, outputs: Numbers) -> None: ...
 def mingru_backward(
     inputs: Numbers,
     saved: Numbers,
     grad_outputs: Numbers,
-    sizes: Sequence[int],
-    resets: Sequence[bool],
+    resets: Flags,
     grad_inputs: Numbers,
     grad_state: Numbers,
 ) -> None: ...

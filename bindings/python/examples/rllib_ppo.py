@@ -31,7 +31,6 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 
 from endless_gym_agents.agent.encoders import FRAME, Encoder
 from endless_gym_agents.agent.heads import PolicyHead, ValueHead
-from endless_gym_agents.memories.recurrence import packed_layers
 from endless_gym_agents.memories.recurrent import RecurrentMemory
 from endless_gym_agents.settings import Recurrence
 
@@ -75,11 +74,10 @@ class GRUModule(TorchRLModule, ValueFunctionAPI):
         """The outputs of the GRU, float32 (B, T, hidden size), for observations (B, T, ...)."""
         observed, hidden = batch[Columns.OBS], batch[Columns.STATE_IN]["hidden"]
         sequences, steps = observed.shape[:2]
-        # In the order of packed sequences: step 0 of all sequences, then step 1, ...
-        flat = observed.transpose(0, 1).flatten(0, 1)
-        encoded = self.memory.embedding(self.encoder({self.key: flat}))
-        outputs = packed_layers(encoded, self.memory.recurrent.all_weights, hidden[None, None], [sequences] * steps)
-        return outputs.unflatten(0, (steps, sequences)).transpose(0, 1)
+        encoded = self.memory.embedding(self.encoder({self.key: observed.transpose(0, 1).flatten(0, 1)}))
+        no_resets = torch.zeros(steps, sequences, dtype=torch.bool)
+        outputs, _ = self.memory.model.sequence(encoded.unflatten(0, (steps, sequences)), {"h0": hidden}, no_resets)
+        return outputs.transpose(0, 1)
 
 
 class ScaleFrames(ConnectorV2):

@@ -17,18 +17,11 @@
 
 use crate::functions::{sigmoid, tanh};
 use crate::matrix::{Matrix, Packed, add_product, add_rows, product_plus_row};
-use crate::sequences::{Sequences, parts, parts_mut};
+use crate::sequences::{Sequences, Workspace, parts, parts_mut};
 use crate::vectors::vectorised;
 
 /// What [`forward`] saves for [`backward`] per step and unit: r, z, n, p and `h'`.
 pub const SAVED: usize = 5;
-
-/// Memory that calls reuse.
-#[derive(Default)]
-pub struct Workspace {
-    packed: Packed,
-    rows: Vec<f32>,
-}
 
 /// Computes the hidden states after all steps.
 ///
@@ -56,20 +49,15 @@ pub fn forward(
     workspace: &mut Workspace,
 ) {
     let width = bias.len() / 3;
-    workspace.rows.resize(sequences.count() * 3 * width, 0.0);
-    for step in sequences.forward() {
-        let saved = &mut saved[step.rows.start * SAVED * width..step.rows.end * SAVED * width];
-        for (row, saved) in step.rows.clone().zip(saved.chunks_exact_mut(SAVED * width)) {
-            step.copy_state_before(row, state, outputs, &mut saved[4 * width..]);
-        }
-        let recurrent = &mut workspace.rows[..step.rows.len() * 3 * width];
-        let before = Matrix::new(saved, SAVED * width).columns(4 * width..5 * width);
+    let recurrent = &mut workspace.rows;
+    recurrent.resize(sequences.count() * 3 * width, 0.0);
+    for step in sequences.steps() {
+        step.copy_states_before(state, outputs, saved, SAVED * width, 4 * width..5 * width);
+        let before = Matrix::new(step.of(saved, SAVED * width), SAVED * width).columns(4 * width..5 * width);
         product_plus_row(recurrent, bias, before, weight);
-        let (saved, recurrent) = (saved.chunks_exact_mut(SAVED * width), recurrent.chunks_exact(3 * width));
-        for ((row, saved), recurrent) in step.rows.clone().zip(saved).zip(recurrent) {
-            let input = &inputs[row * 3 * width..][..3 * width];
-            unit_forward(input, recurrent, saved, &mut outputs[row * width..][..width]);
-        }
+        let rows = step.rows(inputs, 3 * width).zip(recurrent.chunks_exact(3 * width));
+        let rows = rows.zip(step.rows_mut(saved, SAVED * width)).zip(step.rows_mut(outputs, width));
+        rows.for_each(|(((input, recurrent), saved), output)| unit_forward(input, recurrent, saved, output));
     }
 }
 
@@ -129,20 +117,15 @@ pub fn backward(
     let width = grad_bias.len() / 3;
     let Workspace { packed, rows: deltas } = workspace;
     packed.pack(Matrix::new(weight, width));
-    deltas.resize(sequences.steps() * 3 * width, 0.0);
+    deltas.resize(sequences.rows() * 3 * width, 0.0);
     grad_state.fill(0.0);
-    for step in sequences.backward() {
-        for (row, carry) in step.rows.clone().zip(grad_state.chunks_exact_mut(width)) {
-            unit_backward(
-                &saved[row * SAVED * width..][..SAVED * width],
-                &grad_outputs[row * width..][..width],
-                carry,
-                &mut grad_inputs[row * 3 * width..][..3 * width],
-                &mut deltas[row * 3 * width..][..3 * width],
-            );
+    for step in sequences.steps().rev() {
+        let rows = step.rows(saved, SAVED * width).zip(step.rows(grad_outputs, width));
+        let rows = rows.zip(grad_state.chunks_exact_mut(width)).zip(step.rows_mut(grad_inputs, 3 * width));
+        for ((((saved, grad_output), carry), grad_input), delta) in rows.zip(step.rows_mut(deltas, 3 * width)) {
+            unit_backward(saved, grad_output, carry, grad_input, delta);
         }
-        let deltas = Matrix::new(&deltas[step.rows.start * 3 * width..step.rows.end * 3 * width], 3 * width);
-        add_product(&mut grad_state[..step.rows.len() * width], deltas, packed);
+        add_product(grad_state, Matrix::new(step.of(deltas, 3 * width), 3 * width), packed);
         step.stop_at_resets(grad_state, width);
     }
     packed.pack(Matrix::new(saved, SAVED * width).columns(4 * width..5 * width));

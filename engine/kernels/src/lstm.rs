@@ -16,18 +16,11 @@
 
 use crate::functions::{sigmoid, tanh};
 use crate::matrix::{Matrix, Packed, add_product};
-use crate::sequences::{Sequences, parts, parts_mut};
+use crate::sequences::{Sequences, Workspace, parts, parts_mut};
 use crate::vectors::vectorised;
 
 /// What [`forward`] saves for [`backward`] per step and unit: i, f, g, o, tanh(c), `c'` and `h'`.
 pub const SAVED: usize = 7;
-
-/// Memory that calls reuse.
-#[derive(Default)]
-pub struct Workspace {
-    packed: Packed,
-    rows: Vec<f32>,
-}
 
 /// Computes the hidden states and the cell states after all steps.
 ///
@@ -56,21 +49,17 @@ pub fn forward(
     workspace: &mut Workspace,
 ) {
     let width = weight.rows();
-    workspace.rows.resize(sequences.count() * 4 * width, 0.0);
-    for step in sequences.forward() {
-        let saved = &mut saved[step.rows.start * SAVED * width..step.rows.end * SAVED * width];
-        for (row, saved) in step.rows.clone().zip(saved.chunks_exact_mut(SAVED * width)) {
-            step.copy_state_before(row, cell, cells, &mut saved[5 * width..6 * width]);
-            step.copy_state_before(row, hidden, outputs, &mut saved[6 * width..]);
-        }
-        let gates = &mut workspace.rows[..step.rows.len() * 4 * width];
-        gates.copy_from_slice(&inputs[step.rows.start * 4 * width..step.rows.end * 4 * width]);
-        add_product(gates, Matrix::new(saved, SAVED * width).columns(6 * width..7 * width), weight);
-        let (saved, gates) = (saved.chunks_exact_mut(SAVED * width), gates.chunks_exact(4 * width));
-        for ((row, saved), gates) in step.rows.clone().zip(saved).zip(gates) {
-            let (output, cell) = (&mut outputs[row * width..][..width], &mut cells[row * width..][..width]);
-            unit_forward(gates, saved, output, cell);
-        }
+    let gates = &mut workspace.rows;
+    gates.resize(sequences.count() * 4 * width, 0.0);
+    for step in sequences.steps() {
+        step.copy_states_before(cell, cells, saved, SAVED * width, 5 * width..6 * width);
+        step.copy_states_before(hidden, outputs, saved, SAVED * width, 6 * width..7 * width);
+        let before = Matrix::new(step.of(saved, SAVED * width), SAVED * width).columns(6 * width..7 * width);
+        gates.copy_from_slice(step.of(inputs, 4 * width));
+        add_product(gates, before, weight);
+        let rows = gates.chunks_exact(4 * width).zip(step.rows_mut(saved, SAVED * width));
+        let rows = rows.zip(step.rows_mut(outputs, width)).zip(step.rows_mut(cells, width));
+        rows.for_each(|(((gates, saved), output), cell)| unit_forward(gates, saved, output, cell));
     }
 }
 
@@ -138,19 +127,14 @@ pub fn backward(
     packed.pack(Matrix::new(weight, width));
     grad_hidden.fill(0.0);
     grad_cell.fill(0.0);
-    for step in sequences.backward() {
-        let carries = grad_hidden.chunks_exact_mut(width).zip(grad_cell.chunks_exact_mut(width));
-        for (row, (carry, carry_cell)) in step.rows.clone().zip(carries) {
-            unit_backward(
-                &saved[row * SAVED * width..][..SAVED * width],
-                &grad_outputs[row * width..][..width],
-                carry,
-                carry_cell,
-                &mut grad_inputs[row * 4 * width..][..4 * width],
-            );
+    for step in sequences.steps().rev() {
+        let rows = step.rows(saved, SAVED * width).zip(step.rows(grad_outputs, width));
+        let rows = rows.zip(grad_hidden.chunks_exact_mut(width)).zip(grad_cell.chunks_exact_mut(width));
+        for ((((saved, grad_output), carry), carry_cell), grad_input) in rows.zip(step.rows_mut(grad_inputs, 4 * width))
+        {
+            unit_backward(saved, grad_output, carry, carry_cell, grad_input);
         }
-        let deltas = Matrix::new(&grad_inputs[step.rows.start * 4 * width..step.rows.end * 4 * width], 4 * width);
-        add_product(&mut grad_hidden[..step.rows.len() * width], deltas, packed);
+        add_product(grad_hidden, Matrix::new(step.of(grad_inputs, 4 * width), 4 * width), packed);
         step.stop_at_resets(grad_hidden, width);
         step.stop_at_resets(grad_cell, width);
     }

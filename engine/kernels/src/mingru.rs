@@ -31,13 +31,10 @@ pub const SAVED: usize = 2;
 /// The shapes do not fit.
 pub fn forward(sequences: Sequences, inputs: &[f32], state: &[f32], saved: &mut [f32], outputs: &mut [f32]) {
     let Some(width) = state.len().checked_div(sequences.count()) else { return };
-    for step in sequences.forward() {
-        for row in step.rows.clone() {
-            let saved = &mut saved[row * SAVED * width..][..SAVED * width];
-            step.copy_state_before(row, state, outputs, &mut saved[width..]);
-            let (input, output) = (&inputs[row * 2 * width..][..2 * width], &mut outputs[row * width..][..width]);
-            unit_forward(input, saved, output);
-        }
+    for step in sequences.steps() {
+        step.copy_states_before(state, outputs, saved, SAVED * width, width..2 * width);
+        let rows = step.rows(inputs, 2 * width).zip(step.rows_mut(saved, SAVED * width));
+        rows.zip(step.rows_mut(outputs, width)).for_each(|((input, saved), output)| unit_forward(input, saved, output));
     }
 }
 
@@ -82,15 +79,11 @@ pub fn backward(
 ) {
     let Some(width) = grad_state.len().checked_div(sequences.count()) else { return };
     grad_state.fill(0.0);
-    for step in sequences.backward() {
-        for (row, carry) in step.rows.clone().zip(grad_state.chunks_exact_mut(width)) {
-            unit_backward(
-                &inputs[row * 2 * width..][..2 * width],
-                &saved[row * SAVED * width..][..SAVED * width],
-                &grad_outputs[row * width..][..width],
-                carry,
-                &mut grad_inputs[row * 2 * width..][..2 * width],
-            );
+    for step in sequences.steps().rev() {
+        let rows = step.rows(inputs, 2 * width).zip(step.rows(saved, SAVED * width));
+        let rows = rows.zip(step.rows(grad_outputs, width)).zip(grad_state.chunks_exact_mut(width));
+        for ((((input, saved), grad_output), carry), grad_input) in rows.zip(step.rows_mut(grad_inputs, 2 * width)) {
+            unit_backward(input, saved, grad_output, carry, grad_input);
         }
         step.stop_at_resets(grad_state, width);
     }

@@ -12,7 +12,7 @@ use std::ops::Range;
 
 use crate::linear::{self, relu, relu_backward};
 use crate::matrix::{Matrix, Packed};
-use crate::sequences::Sequences;
+use crate::sequences::{Sequences, Workspace};
 use crate::{gru, mingru};
 
 /// Kinds and sizes of the layers.
@@ -210,7 +210,7 @@ pub struct Pass {
     /// Gradients of hidden layers, of one while another is computed.
     grads: [Vec<f32>; 3],
     packed: Packed,
-    gru: gru::Workspace,
+    gru: Workspace,
 }
 
 #[derive(Default)]
@@ -295,7 +295,7 @@ impl Network {
         self.encode(pass);
         let p = &self.parameters[..];
         let embedded = if self.embedding.is_some() { &pass.embedded } else { &pass.encoded };
-        let (steps, hidden_size) = (sequences.steps(), self.spec.hidden_size);
+        let (steps, hidden_size) = (sequences.rows(), self.spec.hidden_size);
         pass.layers.resize_with(self.memory.len(), LayerPass::default);
         for (i, layer) in self.memory.iter().enumerate() {
             let (before, rest) = pass.layers.split_at_mut(i);

@@ -1,106 +1,122 @@
-//! The order of steps in a batch of sequences.
+//! Batches of sequences of the same length.
 
 use std::ops::Range;
+use std::slice::{ChunksExact, ChunksExactMut};
 
-/// Sequences in time-major order: first step 0 of all sequences, then step 1 of the sequences that have one, and so on. Longer
-/// sequences come first. This is the order of PyTorch's `PackedSequence`; there is no padding.
+use crate::matrix::Packed;
+
+/// S sequences of T steps each in time-major order: row t * S + s is step t of sequence s.
 ///
-/// Shapes are given with M, the number of steps of all sequences, and S, the number of sequences.
+/// Shapes are given with M = T * S, the number of steps of all sequences.
 #[derive(Clone, Copy)]
 pub struct Sequences<'a> {
-    sizes: &'a [usize],
+    count: usize,
     resets: &'a [bool],
 }
 
 impl<'a> Sequences<'a> {
-    /// Sequences of which `sizes[t]` have a step `t`.
+    /// So many sequences, S, with as many steps as `resets` (M,) has rows.
     ///
-    /// `resets` (M,) marks steps at which an episode starts: the state before such a step is 0, and no gradient passes it. If it is
-    /// empty, there are none.
+    /// `resets` marks steps at which an episode starts: the state before such a step is 0, and no gradient passes it.
     ///
     /// # Errors
     ///
-    /// Says what is wrong if a size is 0 or larger than the one before, or if there is not one reset for each step.
-    pub fn new(sizes: &'a [usize], resets: &'a [bool]) -> Result<Self, String> {
-        if let Some(t) = (0..sizes.len()).find(|&t| sizes[t] == 0 || (t > 0 && sizes[t] > sizes[t - 1])) {
-            return Err(format!("the sizes must not increase, and be 1 or more; got {} at step {t}", sizes[t]));
+    /// Says what is wrong if the sequences do not have the same number of steps.
+    pub fn new(count: usize, resets: &'a [bool]) -> Result<Self, String> {
+        if !resets.len().is_multiple_of(count) {
+            let steps = resets.len();
+            return Err(format!("{count} sequences must have the same number of steps, got {steps} resets for all"));
         }
-        let steps: usize = sizes.iter().sum();
-        if !resets.is_empty() && resets.len() != steps {
-            return Err(format!("there must be one reset for each of {steps} steps or none, got {}", resets.len()));
-        }
-        Ok(Sequences { sizes, resets })
+        Ok(Sequences { count, resets })
     }
 
     /// S, the number of sequences.
     pub fn count(&self) -> usize {
-        self.sizes.first().copied().unwrap_or(0)
+        self.count
     }
 
     /// M, the number of steps of all sequences.
-    pub fn steps(&self) -> usize {
-        self.sizes.iter().sum()
+    pub fn rows(&self) -> usize {
+        self.resets.len()
     }
 
-    /// The steps of the longest sequence, from the first to the last.
-    pub(crate) fn forward(self) -> impl Iterator<Item = Step<'a>> {
-        let starts = self.sizes.iter().scan(0..0, |rows, size| {
-            *rows = rows.end..rows.end + size;
-            Some(rows.clone())
-        });
-        starts.scan(0, move |previous, rows| {
-            let first = std::mem::replace(previous, rows.start);
-            Some(Step { rows, previous: first, resets: self.resets })
-        })
-    }
-
-    /// The steps of the longest sequence, from the last to the first.
-    pub(crate) fn backward(self) -> impl Iterator<Item = Step<'a>> {
-        let mut start = self.steps();
-        (0..self.sizes.len()).rev().map(move |t| {
-            let rows = start - self.sizes[t]..start;
-            start = rows.start;
-            let previous = if t == 0 { 0 } else { start - self.sizes[t - 1] };
-            Step { rows, previous, resets: self.resets }
-        })
+    /// The steps, from the first to the last.
+    pub(crate) fn steps(self) -> impl DoubleEndedIterator<Item = Step<'a>> {
+        let count = self.count.max(1);
+        let steps = self.resets.chunks_exact(count).enumerate();
+        steps.map(move |(t, resets)| Step { rows: t * count..(t + 1) * count, resets })
     }
 }
 
-/// A step of all sequences that have it.
+/// A step of all sequences.
 pub(crate) struct Step<'a> {
     /// Its rows, one for each sequence.
-    pub rows: Range<usize>,
-    /// The first row of the step before.
-    previous: usize,
+    rows: Range<usize>,
     resets: &'a [bool],
 }
 
 impl Step<'_> {
-    fn is_reset(&self, row: usize) -> bool {
-        self.resets.get(row).is_some_and(|reset| *reset)
+    /// The part of this step (S, width) of a matrix (M, width).
+    pub fn of<'m>(&self, matrix: &'m [f32], width: usize) -> &'m [f32] {
+        &matrix[self.rows.start * width..self.rows.end * width]
     }
 
-    /// Copies the state before a row: from `outputs` (M, width), from `state` (S, width) at the first step, or 0 where an episode
-    /// starts.
-    pub fn copy_state_before(&self, row: usize, state: &[f32], outputs: &[f32], to: &mut [f32]) {
-        let (width, sequence) = (to.len(), row - self.rows.start);
-        if self.is_reset(row) {
-            to.fill(0.0);
-        } else if self.rows.start == 0 {
-            to.copy_from_slice(&state[sequence * width..][..width]);
-        } else {
-            to.copy_from_slice(&outputs[(self.previous + sequence) * width..][..width]);
+    /// As [`of`](Self::of), to write to.
+    pub fn of_mut<'m>(&self, matrix: &'m mut [f32], width: usize) -> &'m mut [f32] {
+        &mut matrix[self.rows.start * width..self.rows.end * width]
+    }
+
+    /// The rows of this step in a matrix (M, width).
+    pub fn rows<'m>(&self, matrix: &'m [f32], width: usize) -> ChunksExact<'m, f32> {
+        self.of(matrix, width).chunks_exact(width)
+    }
+
+    /// As [`rows`](Self::rows), to write to.
+    pub fn rows_mut<'m>(&self, matrix: &'m mut [f32], width: usize) -> ChunksExactMut<'m, f32> {
+        self.of_mut(matrix, width).chunks_exact_mut(width)
+    }
+
+    /// Copies the states before this step to columns of `saved` (M, `saved_width`): from `outputs` (M, H), from `state` (S, H) at the first
+    /// step, or 0 where an episode starts.
+    pub fn copy_states_before(
+        &self,
+        state: &[f32],
+        outputs: &[f32],
+        saved: &mut [f32],
+        saved_width: usize,
+        columns: Range<usize>,
+    ) {
+        let width = columns.len();
+        let before = match self.rows.start.checked_sub(self.rows.len()) {
+            Some(start) => &outputs[start * width..self.rows.start * width],
+            None => state,
+        };
+        let rows = self.rows_mut(saved, saved_width).zip(before.chunks_exact(width));
+        for ((saved, before), is_reset) in rows.zip(self.resets) {
+            let saved = &mut saved[columns.clone()];
+            if *is_reset {
+                saved.fill(0.0);
+            } else {
+                saved.copy_from_slice(before);
+            }
         }
     }
 
     /// Stops the gradients (S, width) of the states before this step where an episode starts.
     pub fn stop_at_resets(&self, gradients: &mut [f32], width: usize) {
-        for (row, gradient) in self.rows.clone().zip(gradients.chunks_exact_mut(width)) {
-            if self.is_reset(row) {
+        for (gradient, is_reset) in gradients.chunks_exact_mut(width).zip(self.resets) {
+            if *is_reset {
                 gradient.fill(0.0);
             }
         }
     }
+}
+
+/// Memory that calls of a layer reuse.
+#[derive(Default)]
+pub struct Workspace {
+    pub(crate) packed: Packed,
+    pub(crate) rows: Vec<f32>,
 }
 
 /// The parts of equal width of a row.
@@ -121,21 +137,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn steps_forward_and_backward_have_the_same_rows() {
-        let sequences = Sequences::new(&[3, 3, 1], &[]).unwrap();
-        let forward: Vec<_> = sequences.forward().map(|step| (step.rows, step.previous)).collect();
-        assert_eq!(forward, [(0..3, 0), (3..6, 0), (6..7, 3)]);
-        let mut backward: Vec<_> = sequences.backward().map(|step| (step.rows, step.previous)).collect();
-        backward.reverse();
-        assert_eq!(forward, backward);
-        assert_eq!((sequences.count(), sequences.steps()), (3, 7));
-    }
-
-    #[test]
-    fn errors_name_the_size_or_the_number_of_resets() {
-        let message = |sizes: &[usize], resets: &[bool]| Sequences::new(sizes, resets).err().unwrap();
-        assert_eq!(message(&[2, 3], &[]), "the sizes must not increase, and be 1 or more; got 3 at step 1");
-        assert_eq!(message(&[2, 0], &[]), "the sizes must not increase, and be 1 or more; got 0 at step 1");
-        assert_eq!(message(&[2], &[true]), "there must be one reset for each of 2 steps or none, got 1");
+    fn errors_name_the_sequences_and_the_resets() {
+        let message = |count: usize| Sequences::new(count, &[false; 3]).err();
+        assert_eq!(message(3), None);
+        assert_eq!(message(2).unwrap(), "2 sequences must have the same number of steps, got 3 resets for all");
+        assert_eq!(message(0).unwrap(), "0 sequences must have the same number of steps, got 3 resets for all");
     }
 }

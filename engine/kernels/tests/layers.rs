@@ -4,7 +4,7 @@
 use endless_gym_core::conformance::{CountingAllocator, allocations};
 use endless_gym_core::random::Generator;
 use endless_gym_kernels::matrix::{Matrix, Packed, add_product};
-use endless_gym_kernels::sequences::Sequences;
+use endless_gym_kernels::sequences::{Sequences, Workspace};
 use endless_gym_kernels::{gru, linear, lstm, mingru};
 
 #[global_allocator]
@@ -45,15 +45,10 @@ fn every_number_of_a_product_is_the_sum_of_its_terms_in_order() {
     }
 }
 
-/// Random sequences, some of one step, with or without episodes that start within them.
-fn batch(random: &mut Generator) -> (Vec<usize>, Vec<bool>) {
-    let mut lengths: Vec<usize> = (0..size(random, 9)).map(|_| size(random, 6)).collect();
-    lengths.push(1);
-    let longest = lengths.iter().max().copied().unwrap_or(0);
-    let sizes: Vec<usize> = (0..longest).map(|t| lengths.iter().filter(|length| **length > t).count()).collect();
-    let has_resets = random.integers(0, 2) == 1;
-    let resets = if has_resets { lengths.iter().sum() } else { 0 };
-    (sizes, (0..resets).map(|_| random.integers(0, 4) == 0).collect())
+/// A number of random sequences and their resets: with or without episodes that start within them.
+fn batch(random: &mut Generator) -> (usize, Vec<bool>) {
+    let (count, length, has_resets) = (size(random, 10), size(random, 6), random.integers(0, 2) == 1);
+    (count, (0..count * length).map(|_| has_resets && random.integers(0, 4) == 0).collect())
 }
 
 /// The shape of an argument: of M steps, S sequences, and a multiple of H units.
@@ -90,8 +85,7 @@ struct Memory {
     grad_outputs: Vec<f32>,
     /// One for each argument.
     gradients: Vec<Vec<f32>>,
-    gru: gru::Workspace,
-    lstm: lstm::Workspace,
+    workspace: Workspace,
 }
 
 const LAYERS: [Layer; 3] = [
@@ -101,14 +95,14 @@ const LAYERS: [Layer; 3] = [
         arguments: &[Inputs(3), State, Weight(3), Bias(3)],
         forward: |sequences, arguments, memory| {
             let [inputs, state, weight, bias] = arguments else { unreachable!() };
-            let Memory { packed, saved, outputs, gru, .. } = memory;
+            let Memory { packed, saved, outputs, workspace, .. } = memory;
             packed.pack(Matrix::new(weight, bias.len() / 3).t());
-            gru::forward(sequences, inputs, packed, bias, state, saved, outputs, gru);
+            gru::forward(sequences, inputs, packed, bias, state, saved, outputs, workspace);
         },
         backward: |sequences, arguments, memory| {
-            let Memory { saved, grad_outputs, gradients, gru, .. } = memory;
+            let Memory { saved, grad_outputs, gradients, workspace, .. } = memory;
             let [inputs, state, weight, bias] = &mut gradients[..] else { unreachable!() };
-            gru::backward(sequences, &arguments[2], saved, grad_outputs, inputs, weight, bias, state, gru);
+            gru::backward(sequences, &arguments[2], saved, grad_outputs, inputs, weight, bias, state, workspace);
         },
     },
     Layer {
@@ -117,14 +111,14 @@ const LAYERS: [Layer; 3] = [
         arguments: &[Inputs(4), State, State, Weight(4)],
         forward: |sequences, arguments, memory| {
             let [inputs, hidden, cell, weight] = arguments else { unreachable!() };
-            let Memory { packed, saved, outputs, cells, lstm, .. } = memory;
+            let Memory { packed, saved, outputs, cells, workspace, .. } = memory;
             packed.pack(Matrix::new(weight, (weight.len() / 4).isqrt()).t());
-            lstm::forward(sequences, inputs, packed, hidden, cell, saved, outputs, cells, lstm);
+            lstm::forward(sequences, inputs, packed, hidden, cell, saved, outputs, cells, workspace);
         },
         backward: |sequences, arguments, memory| {
-            let Memory { saved, grad_outputs, gradients, lstm, .. } = memory;
+            let Memory { saved, grad_outputs, gradients, workspace, .. } = memory;
             let [inputs, hidden, cell, weight] = &mut gradients[..] else { unreachable!() };
-            lstm::backward(sequences, &arguments[3], saved, grad_outputs, inputs, weight, hidden, cell, lstm);
+            lstm::backward(sequences, &arguments[3], saved, grad_outputs, inputs, weight, hidden, cell, workspace);
         },
     },
     Layer {
@@ -144,7 +138,7 @@ const LAYERS: [Layer; 3] = [
 
 /// Random arguments of a layer, and its memory.
 fn random_case(layer: &Layer, sequences: Sequences, units: usize, random: &mut Generator) -> (Vec<Vec<f32>>, Memory) {
-    let (m, s) = (sequences.steps(), sequences.count());
+    let (m, s) = (sequences.rows(), sequences.count());
     let arguments: Vec<_> = (layer.arguments.iter())
         .map(|shape| match shape {
             Inputs(multiple) => normals(random, m * multiple * units),
@@ -205,8 +199,8 @@ fn gradients_of_recurrent_layers_equal_finite_differences() {
     let mut random = Generator::from_seed(2);
     for layer in &LAYERS {
         for case in 0..30 {
-            let (sizes, resets) = if case == 0 { Default::default() } else { batch(&mut random) };
-            let sequences = Sequences::new(&sizes, &resets).unwrap();
+            let (count, resets) = if case == 0 { Default::default() } else { batch(&mut random) };
+            let sequences = Sequences::new(count, &resets).unwrap();
             let units = size(&mut random, 20);
             let (mut arguments, mut memory) = random_case(layer, sequences, units, &mut random);
             (layer.forward)(sequences, &arguments, &mut memory);
@@ -240,51 +234,90 @@ fn gradients_of_a_linear_layer_equal_finite_differences() {
     }
 }
 
+/// Rows `start`, `start + stride`, ... of a matrix with `rows` rows.
+fn every(matrix: &[f32], rows: usize, start: usize, stride: usize, count: usize) -> Vec<f32> {
+    let rows = matrix.chunks_exact(matrix.len() / rows);
+    rows.skip(start).step_by(stride).take(count).flatten().copied().collect()
+}
+
 #[test]
-fn an_episode_that_starts_within_a_sequence_equals_a_sequence_of_its_own() {
-    let mut random = Generator::from_seed(4);
+fn episodes_within_sequences_equal_sequences_of_their_own() {
+    let (mut random, count, length, units) = (Generator::from_seed(4), 5, 8, 19);
     for layer in &LAYERS {
-        // Two sequences of six steps; the second one starts an episode at step 2.
-        let (units, sizes, mut resets) = (19, [2; 6], [false; 12]);
-        resets[5] = true;
-        let sequences = Sequences::new(&sizes, &resets).unwrap();
+        let resets: Vec<bool> = (0..count * length).map(|_| random.integers(0, 4) == 0).collect();
+        assert!(resets[count..].iter().filter(|reset| **reset).count() > 4);
+        let sequences = Sequences::new(count, &resets).unwrap();
         let (mut arguments, mut memory) = random_case(layer, sequences, units, &mut random);
-        // Only the episode has gradients.
-        for row in [0, 1, 2, 3, 4, 6, 8, 10] {
-            memory.grad_outputs[row * units..][..units].fill(0.0);
-        }
         (layer.forward)(sequences, &arguments, &mut memory);
         (layer.backward)(sequences, &arguments, &mut memory);
-
-        let rows = |data: &[f32]| -> Vec<f32> {
-            let width = data.len() / 12;
-            [5, 7, 9, 11].iter().flat_map(|row| data[row * width..][..width].to_vec()).collect()
-        };
-        let alone = Sequences::new(&[1; 4], &[]).unwrap();
-        let (_, mut memory_alone) = random_case(layer, alone, units, &mut random);
-        memory_alone.grad_outputs = rows(&memory.grad_outputs);
-        let inputs = std::mem::take(&mut arguments[0]);
-        arguments[0] = rows(&inputs);
-        for (argument, shape) in arguments.iter_mut().zip(layer.arguments) {
-            if matches!(shape, State) {
-                *argument = vec![0.0; units];
+        let whole = (arguments.clone(), std::mem::take(&mut memory.gradients));
+        let mut sums: Vec<_> = arguments.iter().map(|argument| vec![0.0_f32; argument.len()]).collect();
+        for sequence in 0..count {
+            let mut start = 0;
+            for end in 1..=length {
+                if end < length && !resets[end * count + sequence] {
+                    continue;
+                }
+                let (first, steps, is_reset) =
+                    (start * count + sequence, end - start, resets[start * count + sequence]);
+                start = end;
+                let rows = |matrix: &[f32]| every(matrix, count * length, first, count, steps);
+                let no_resets = vec![false; steps];
+                let alone = Sequences::new(1, &no_resets).unwrap();
+                let (_, mut memory_alone) = random_case(layer, alone, units, &mut random);
+                memory_alone.grad_outputs = rows(&memory.grad_outputs);
+                for ((argument, whole), shape) in arguments.iter_mut().zip(&whole.0).zip(layer.arguments) {
+                    match shape {
+                        Inputs(_) => *argument = rows(whole),
+                        State if is_reset => *argument = vec![0.0; units],
+                        State => *argument = every(whole, count, sequence, count, 1),
+                        Weight(_) | Bias(_) => {}
+                    }
+                }
+                (layer.forward)(alone, &arguments, &mut memory_alone);
+                (layer.backward)(alone, &arguments, &mut memory_alone);
+                assert_eq!(rows(&memory.outputs), memory_alone.outputs, "{}", layer.name);
+                let gradients = memory_alone.gradients.iter().zip(&whole.1).zip(&mut sums).zip(layer.arguments);
+                for (((alone, whole), sum), shape) in gradients {
+                    match shape {
+                        Inputs(_) => assert_eq!(*alone, rows(whole), "{}", layer.name),
+                        State if !is_reset => sum[sequence * units..][..units].copy_from_slice(alone),
+                        State => {}
+                        Weight(_) | Bias(_) => sum.iter_mut().zip(alone).for_each(|(sum, x)| *sum += x),
+                    }
+                }
             }
         }
-        (layer.forward)(alone, &arguments, &mut memory_alone);
-        (layer.backward)(alone, &arguments, &mut memory_alone);
-
-        assert_eq!(rows(&memory.outputs), memory_alone.outputs, "{}", layer.name);
-        let gradients = memory.gradients.iter().zip(&memory_alone.gradients).zip(layer.arguments);
-        for ((gradient, gradient_alone), shape) in gradients {
+        for ((sum, whole), shape) in sums.iter().zip(&whole.1).zip(layer.arguments) {
             match shape {
-                Inputs(_) => {
-                    assert_eq!(rows(gradient), *gradient_alone, "{}", layer.name);
-                    let total = |gradient: &[f32]| gradient.iter().filter(|x| **x != 0.0).count();
-                    assert_eq!(total(gradient), total(gradient_alone), "{}: gradients passed the reset", layer.name);
+                Inputs(_) => {}
+                State => assert_eq!(sum, whole, "{}: gradients passed a reset", layer.name),
+                Weight(_) | Bias(_) => {
+                    let scale = whole.iter().fold(0.0, |max: f32, x| max.max(x.abs()));
+                    assert!(sum.iter().zip(whole).all(|(a, b)| (a - b).abs() <= 1e-6 * scale), "{}", layer.name);
                 }
-                State => assert!(gradient.iter().all(|x| *x == 0.0), "{}: gradients passed the reset", layer.name),
-                Weight(_) | Bias(_) => assert_eq!(gradient, gradient_alone, "{}", layer.name),
             }
+        }
+    }
+}
+
+#[test]
+fn steps_one_by_one_equal_whole_sequences() {
+    let (mut random, count, length, units) = (Generator::from_seed(6), 7, 9, 21);
+    for layer in &LAYERS {
+        let resets: Vec<bool> = (0..count * length).map(|_| random.integers(0, 4) == 0).collect();
+        let sequences = Sequences::new(count, &resets).unwrap();
+        let (mut arguments, mut memory) = random_case(layer, sequences, units, &mut random);
+        (layer.forward)(sequences, &arguments, &mut memory);
+        let inputs = arguments[0].clone();
+        for (t, resets) in resets.chunks(count).enumerate() {
+            let step = Sequences::new(count, resets).unwrap();
+            let (_, mut now) = random_case(layer, step, units, &mut random);
+            arguments[0] = every(&inputs, count * length, t * count, 1, count);
+            (layer.forward)(step, &arguments, &mut now);
+            assert_eq!(now.outputs, memory.outputs[t * count * units..][..count * units], "{}, step {t}", layer.name);
+            let states = arguments.iter_mut().zip(layer.arguments).filter(|(_, shape)| matches!(shape, State));
+            states.zip([now.outputs, now.cells]).for_each(|((state, _), after)| *state = after);
         }
     }
 }
@@ -292,7 +325,7 @@ fn an_episode_that_starts_within_a_sequence_equals_a_sequence_of_its_own() {
 #[test]
 fn calls_do_not_allocate_once_the_workspace_has_grown() {
     let mut random = Generator::from_seed(5);
-    let sequences = Sequences::new(&[4, 4, 1], &[]).unwrap();
+    let sequences = Sequences::new(3, &[false; 9]).unwrap();
     let counted = |call: &mut dyn FnMut()| {
         let before = allocations();
         call();

@@ -12,7 +12,7 @@ use endless_gym_core::pool::ResetRequest;
 use endless_gym_core::random::Generator;
 use endless_gym_kernels::adamw::AdamW;
 use endless_gym_kernels::matrix::{Matrix, Packed};
-use endless_gym_kernels::sequences::Sequences;
+use endless_gym_kernels::sequences::{Sequences, Workspace};
 use endless_gym_kernels::{categorical, gru, linear};
 use endless_gym_service::{ConnectConfig, Trainer};
 
@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (mut states, mut saved) = (vec![0.0; rows * UNITS], vec![0.0; rows * gru::SAVED * UNITS]);
     let (mut logits, mut actions) = (vec![0.0; rows * choices[0]], vec![0; rows]);
     let (mut rewards, mut starts) = (vec![0.0; rows], vec![true; rows + n]);
-    let (mut state, mut workspace) = (vec![0.0; n * UNITS], gru::Workspace::default());
+    let (mut state, mut workspace) = (vec![0.0; n * UNITS], Workspace::default());
     trainer.reset(0, ResetRequest::All)?;
     let mut lease = trainer.receive(0, TIMEOUT)?;
     for update in 1..=updates {
@@ -65,9 +65,8 @@ fn main() -> Result<(), Box<dyn Error>> {
             x[part(features)].copy_from_slice(lease.batch().features());
             let [input, hidden, policy] = &layers;
             linear::forward(&x[part(features)], &input.2, &input.1[1].0, &mut projected[part(3 * UNITS)]);
-            let (now, saved) = ([n], &mut saved[part(gru::SAVED * UNITS)]);
-            let (now, after) = (Sequences::new(&now, &starts[part(1)])?, &mut states[part(UNITS)]);
-            let (gates, bias) = (&projected[part(3 * UNITS)], &hidden.1[1].0);
+            let (now, saved) = (Sequences::new(n, &starts[part(1)])?, &mut saved[part(gru::SAVED * UNITS)]);
+            let (gates, bias, after) = (&projected[part(3 * UNITS)], &hidden.1[1].0, &mut states[part(UNITS)]);
             gru::forward(now, gates, &hidden.2, bias, &state, saved, after, &mut workspace);
             state.copy_from_slice(after);
             let logits = &mut logits[part(choices[0])];
@@ -94,9 +93,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         let ([input, hidden, policy], mut packed) = (&mut layers, Packed::default());
         let [(w, dw, _), (_, db, _)] = &mut policy.1;
         linear::backward(&states, w, &grad_logits, Some(&mut grad_states), dw, db, &mut packed);
-        let (sizes, mut grad_first) = ([n; STEPS], vec![0.0; n * UNITS]);
         let [(w, dw, _), (_, db, _)] = &mut hidden.1;
-        let all = Sequences::new(&sizes, &starts[..rows])?;
+        let (all, mut grad_first) = (Sequences::new(n, &starts[..rows])?, vec![0.0; n * UNITS]);
         gru::backward(all, w, &saved, &grad_states, &mut grad_projected, dw, db, &mut grad_first, &mut workspace);
         let [(w, dw, _), (_, db, _)] = &mut input.1;
         linear::backward(&x, w, &grad_projected, None, dw, db, &mut packed);

@@ -282,8 +282,7 @@ impl Player {
             for (state, hidden) in pass.states.iter_mut().zip(hidden) {
                 copy(state, &hidden[times(envs, network.spec.hidden_size)]);
             }
-            let sizes = [envs.len()];
-            let sequences = Sequences::new(&sizes, &starts[envs.clone()]).expect("one step of each environment");
+            let sequences = Sequences::new(envs.len(), &starts[envs.clone()]).expect("one step of each environment");
             network.forward(sequences, pass);
         });
     }

@@ -173,7 +173,7 @@ pub struct Recurrence {
     /// Fully connected layer before the recurrent layers.
     #[arg(long = "recurrence.embedding", default_value_t = true, action = ArgAction::Set, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub embedding: bool,
-    /// Length of truncated BPTT in steps; longer segments are cut into sequences that start from stored hidden states.
+    /// Length of truncated BPTT in steps; a longer segment is a multiple of it, and its sequences start from stored hidden states.
     #[arg(long = "recurrence.sequence-length", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
     pub sequence_length: usize,
 }
@@ -368,9 +368,9 @@ impl Settings {
         self.environment.option.iter().map(|given| parse(given).ok_or_else(|| wrong(given))).collect()
     }
 
-    /// Steps of a sequence, at most. Without a memory, steps are shuffled one by one.
+    /// Steps of a sequence. Without a memory, steps are shuffled one by one.
     pub fn sequence_length(&self) -> usize {
-        if self.agent == Agent::None { 1 } else { self.recurrence.sequence_length }
+        if self.agent == Agent::None { 1 } else { self.recurrence.sequence_length.min(self.ppo.steps) }
     }
 
     /// These settings with the environments of an engine.
@@ -406,6 +406,10 @@ impl Settings {
         } else if steps > MAX_STEPS {
             let given = ppo.steps;
             format!("an update must have at most {MAX_STEPS} steps, got {num_envs} environments and {given} steps")
+        } else if ppo.steps % self.sequence_length() != 0 {
+            let (given, length) = (ppo.steps, recurrence.sequence_length);
+            let rule = "--ppo.steps must be a multiple of --recurrence.sequence-length";
+            format!("{rule}, got {given} steps and sequences of {length}")
         } else if ppo.minibatches > steps {
             let given = ppo.minibatches;
             format!("--ppo.minibatches must be 1 to {steps}, the steps of an update, got {given}")

@@ -5,9 +5,9 @@ use endless_gym_kernels::adamw::{AdamW, clip_norm};
 use endless_gym_kernels::sequences::Sequences;
 use endless_gym_kernels::{categorical, ppo};
 
-use crate::minibatches::{Sequence, minibatches, packed, sequences, shards};
+use crate::minibatches::{minibatches, rows, sequences, shards};
 use crate::rollout::Segment;
-use crate::settings::{Agent, Ppo, Scope, Settings};
+use crate::settings::{Ppo, Scope, Settings};
 use crate::threads::{Threads, part};
 use endless_gym_kernels::network::{Network, Pass};
 
@@ -25,12 +25,11 @@ pub struct Learner {
 #[derive(Default)]
 struct Shard {
     pass: Pass,
-    sequences: Vec<Sequence>,
+    sequences: Vec<usize>,
     rows: Vec<usize>,
-    sizes: Vec<usize>,
     resets: Vec<bool>,
     actions: Vec<usize>,
-    /// The rows' part of the minibatch's steps.
+    /// Its part of the minibatch's sequences.
     share: f64,
     losses: [f64; LOSSES.len()],
 }
@@ -83,28 +82,26 @@ impl Learner {
             normalise(&mut advantages);
         }
         let targets = Targets { advantages, returns };
-        // As the Python agents: the steps of a minGRU are independent enough that whole sequences are faster.
-        let none = vec![false; segment.starts.len()];
-        let cuts = if settings.agent == Agent::MinGru { &none } else { &segment.starts };
-        let all = sequences(cuts, num_envs, settings.sequence_length());
+        let length = settings.sequence_length();
+        let all = sequences(ppo.steps, num_envs, length);
         let (mut losses, mut norms, mut count) = ([0.0; LOSSES.len()], 0.0, 0.0);
         for _ in 0..ppo.epochs {
             for minibatch in minibatches(&all, ppo.minibatches, random) {
                 let parts = shards(&minibatch);
                 self.shards.resize_with(self.shards.len().max(parts.len()), Shard::default);
                 let parts_count = parts.len();
-                let steps: usize = minibatch.iter().map(|sequence| sequence.length).sum();
                 let normal = match ppo.advantage_normalisation {
-                    Scope::Minibatch => scale_of(&minibatch, num_envs, &targets.advantages),
+                    Scope::Minibatch => scale_of(&minibatch, num_envs, length, &targets.advantages),
                     Scope::None | Scope::Batch => (0.0, 1.0),
                 };
                 for (shard, sequences) in self.shards.iter_mut().zip(parts) {
+                    shard.share = sequences.len() as f64 / minibatch.len() as f64;
                     shard.sequences = sequences;
                 }
                 let shards = &mut self.shards[..parts_count];
                 let frozen = &*network;
                 threads.for_each(shards, |_, shard| {
-                    shard.compute(frozen, segment, &targets, normal, steps, settings, entropy_coefficient);
+                    shard.compute(frozen, segment, &targets, normal, settings, entropy_coefficient);
                 });
                 sum_gradients(shards, threads);
                 for shard in &*shards {
@@ -127,37 +124,34 @@ impl Learner {
 
 impl Shard {
     /// Computes the losses and gradients of the shard, each the mean over its steps.
-    #[allow(clippy::too_many_arguments)]
     fn compute(
         &mut self,
         network: &Network,
         segment: &Segment,
         targets: &Targets,
         (mean, deviation): (f32, f32),
-        minibatch_steps: usize,
         settings: &Settings,
         entropy_coefficient: f64,
     ) {
         let (num_envs, branches, width) =
             (segment.last_values.len(), network.spec.choices.len(), network.spec.observation_width);
-        packed(&self.sequences, num_envs, &mut self.rows, &mut self.sizes);
-        let (rows, pass) = (&self.rows[..], &mut self.pass);
-        let steps = rows.len();
-        self.share = steps as f64 / minibatch_steps as f64;
+        let length = settings.sequence_length();
+        self.rows.clear();
+        self.rows.extend(rows(&self.sequences, num_envs, length));
+        let (rows, steps, pass) = (&self.rows[..], self.rows.len(), &mut self.pass);
         gather(rows, &segment.observations, width, &mut pass.observations);
         gather(rows, &segment.actions, branches, &mut self.actions);
         gather(rows, &segment.starts, 1, &mut self.resets);
         pass.states.resize_with(network.spec.layers, Vec::new);
         for (layer, state) in pass.states.iter_mut().enumerate() {
             state.clear();
-            for Sequence { env, start, .. } in &self.sequences {
+            for first in &self.sequences {
+                let (stored, env) = (&segment.stored[first / num_envs / length][layer], first % num_envs);
                 let size = network.spec.hidden_size;
-                // A sequence that does not start at a cut starts an episode, whose first state the resets make 0.
-                let stored = &segment.stored[start / settings.sequence_length()][layer];
                 state.extend_from_slice(&stored[env * size..(env + 1) * size]);
             }
         }
-        let sequences = Sequences::new(&self.sizes, &self.resets).expect("sequences in decreasing order of length");
+        let sequences = Sequences::new(self.sequences.len(), &self.resets).expect("sequences of the same length");
         network.forward(sequences, pass);
         categorical::log_softmax(&mut pass.logits, &network.spec.choices);
         let of = |all: &[f32]| rows.iter().map(|row| all[*row]).collect::<Vec<f32>>();
@@ -271,9 +265,9 @@ fn scale(advantages: &[f32]) -> (f64, f64) {
 }
 
 /// What normalises the advantages of a minibatch.
-fn scale_of(minibatch: &[Sequence], num_envs: usize, advantages: &[f32]) -> (f32, f32) {
-    let rows = minibatch.iter().flat_map(|s| (s.start..s.start + s.length).map(|step| step * num_envs + s.env));
-    let (mean, deviation) = scale(&rows.map(|row| advantages[row]).collect::<Vec<f32>>());
+fn scale_of(minibatch: &[usize], num_envs: usize, length: usize, advantages: &[f32]) -> (f32, f32) {
+    let of = |first: &usize| advantages[*first..].iter().step_by(num_envs).take(length);
+    let (mean, deviation) = scale(&minibatch.iter().flat_map(of).copied().collect::<Vec<f32>>());
     (mean as f32, deviation as f32)
 }
 

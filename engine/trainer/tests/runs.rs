@@ -27,7 +27,7 @@ use serde_json::Value as Json;
 
 /// A short run with small networks, on two layers and sequences shorter than a segment.
 const SMALL: &str = "MortarMayhem-Grid-v0 --environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 24 \
-                     --recurrence.sequence-length 10 --recurrence.hidden-size 16 --recurrence.layers 2 --model.head-width 8 \
+                     --recurrence.sequence-length 8 --recurrence.hidden-size 16 --recurrence.layers 2 --model.head-width 8 \
                      --ppo.minibatches 2 --no-stop-when-learnt --ppo.updates 4";
 
 fn parse(text: &str) -> Result<Settings, String> {
@@ -286,6 +286,7 @@ fn errors_say_what_is_allowed_and_leave_nothing() {
     for (arguments, expected) in [
         (format!("{new} --environment.groups 3"), "must be a multiple of --environment.groups, got 8 environments"),
         (format!("{new} --ppo.minibatches 193"), "--ppo.minibatches must be 1 to 192"),
+        (format!("{new} --recurrence.sequence-length 10"), "multiple of --recurrence.sequence-length, got 24 steps"),
         (format!("{new} --environment.option x"), "must be NAME=VALUE with a JSON value"),
         (format!("{new} --environment.option colour=1"), "colour"),
         (format!("{new} --init-from {at}/nowhere"), "nowhere does not exist"),
@@ -457,11 +458,11 @@ fn gradients_equal_finite_differences() {
                 settings(&format!("{SMALL} --agent {agent} {residual} --model.value-gain 1 --model.vector-width 5"));
             let mut random = Generator::from_seed(8);
             let mut network = network::new(&settings, 4, vec![3, 2], &mut random);
-            let (sizes, resets) = ([3, 3, 2], [true, false, false, false, true, false, false, false]);
-            let sequences = Sequences::new(&sizes, &resets).unwrap();
+            let resets = [true, false, false, false, true, false, false, false, false];
+            let sequences = Sequences::new(3, &resets).unwrap();
             let mut normals = |count: usize| (0..count).map(|_| random.standard_normal() as f32).collect::<Vec<f32>>();
             let states = (0..network.spec.layers).map(|_| normals(3 * 16)).collect();
-            let (observations, grad_logits, grad_values) = (normals(8 * 4), normals(8 * 5), normals(8));
+            let (observations, grad_logits, grad_values) = (normals(9 * 4), normals(9 * 5), normals(9));
             let mut pass = Pass::default();
             (pass.observations, pass.states) = (observations, states);
             (pass.grad_logits, pass.grad_values) = (grad_logits, grad_values);

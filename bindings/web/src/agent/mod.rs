@@ -139,7 +139,7 @@ impl Agent {
         if let Some(stack) = &self.stack {
             return self.network.forward_with(pass, |x| stack.step(x, states));
         }
-        self.network.forward(Sequences::new(&[1], &[]).expect("one step"), pass);
+        self.network.forward(Sequences::new(1, &[false]).expect("one step"), pass);
         for layer in 0..pass.states.len() {
             let after = pass.hidden(layer).to_vec();
             pass.states[layer] = after;

@@ -118,7 +118,7 @@ fn a_checkpoint_of_the_trainer_plays_as_in_the_trainer() {
         }
         assert!(chosen.iter().all(|count| *count < 40), "{chosen:?}");
         whole.states = vec![vec![0.0; trained.spec.hidden_size]; trained.spec.layers];
-        trained.forward(Sequences::new(&[1; 40], &[]).unwrap(), &mut whole);
+        trained.forward(Sequences::new(1, &[false; 40]).unwrap(), &mut whole);
         assert_eq!(found, whole.logits, "{agent}");
     }
     std::fs::remove_dir_all(folder).unwrap();
