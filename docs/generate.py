@@ -221,19 +221,15 @@ def errors(names: str) -> str:
 
 
 def error_types() -> dict[str, dict[str, tuple[str, str]]]:
-    """Message and cause by error type and variant. Errors that show another error's message are left out, and so are those of the
-    learner, whose messages say what to do.
-    """
+    """Message and cause by error type and variant. Errors with no message of their own are left out."""
     types = {}
     for file in sorted((ROOT / "engine").glob("*/src/**/*.rs")):
-        if file.relative_to(ROOT / "engine").parts[0] in ("kernels", "trainer"):
-            continue
         for doc, attributes, kind, name, body in ERROR_TYPE.findall(file.read_text()):
             described = [(doc, attributes, "self", body)] if kind == "struct" else VARIANT.findall(body)
             types[name] = {
                 variant: (message(*found.groups(), fields), cause(doc))
                 for doc, attribute, variant, fields in described
-                if (found := FORMAT.search(attribute))
+                if (found := FORMAT.search(attribute)) and found[1] != "{0}"
             }
     return types
 
@@ -248,12 +244,14 @@ def message(text: str, arguments: str, fields: str) -> str:
     """The text of a format string, with names in angle brackets in place of values."""
     names = set(re.findall(r"(\w+):", fields))
     # Commas inside parentheses do not separate arguments.
-    values = iter(part for part in re.split(r",(?![^(]*\))", arguments) if part.strip())
+    values = [part for part in re.split(r",(?![^(]*\))", arguments) if part.strip()]
+    unnamed = iter(values)
 
     def placeholder(found: re.Match[str]) -> str:
-        if name := found[1].split(":")[0]:
+        name = found[1].split(":")[0]
+        if name and not (name.isdigit() and values):
             return f"<{name}>"
-        value = next(values, "").strip()
+        value = values[int(name)] if name else next(unnamed, "").strip()
         word = next((word for word in re.findall(r"\w+", value) if word in names and " - " not in value), "...")
         return f" (process <{word}>)" if value.startswith("in_process") else f"<{word}>"
 
