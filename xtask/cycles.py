@@ -1,4 +1,4 @@
-"""Fail if files of a crate or a Python package import each other in a cycle, or if a folder imports one above it.
+"""Fail if files of a crate, or files or rooms of a Python package, import each other in a cycle, or a folder one above it.
 
 Run `python xtask/cycles.py`.
 """
@@ -14,8 +14,6 @@ import tomllib
 
 #: The folders with code, each of which uses only itself and those before it, in Rust and in Python.
 FLOORS = ["engine", "src", "bindings", "agents"]
-#: The rooms of the agents, in the same order.
-ROOMS = ["common", "settings", "environments", "memories", "agent", "training", "evaluation", "paper"]
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
 CRATES = [
     "engine/kernels",
@@ -130,6 +128,14 @@ def python_imports(folder: Path) -> dict[Module, set[Module]]:
     return found
 
 
+def room_imports(folder: Path) -> dict[Module, set[Module]]:
+    """For each room of a package, a folder or a file at its top, the rooms that it imports."""
+    found: dict[Module, set[Module]] = {}
+    for module, imported in python_imports(folder).items():
+        found.setdefault(module[:2], set()).update({name[:2] for name in imported} - {module[:2]})
+    return found
+
+
 def upward_imports() -> Iterator[str]:
     """Crates and Python files of a floor that depend on a crate or a package of a higher one."""
     crates = {
@@ -149,33 +155,25 @@ def upward_imports() -> Iterator[str]:
                     yield from (f"{path}: {name}" for name in imported if packages.get(name) in above)
 
 
-def upward_rooms() -> Iterator[str]:
-    """Modules of the agents that import a room above their own."""
-    for module, imported in python_imports(Path("agents/endless_gym_agents")).items():
-        room = module[1] if len(module) > 1 else ""
-        above = ROOMS[ROOMS.index(room) + 1 :] if room in ROOMS else []
-        yield from (f"{'.'.join(module)}: {'.'.join(name)}" for name in imported if len(name) > 1 and name[1] in above)
-
-
 def manifests(floor: str) -> list[Path]:
     """The manifests of a floor's crates; that of `src` is the root's."""
     return [Path("Cargo.toml")] if floor == "src" else sorted(Path(floor).glob("*/Cargo.toml"))
 
 
 failed = False
-for upward in (*upward_imports(), *upward_rooms()):
+for upward in upward_imports():
     failed = True
     print(f"{upward} is of a higher folder")
 for folder, imports in [
     *((Path(crate, "src"), rust_imports) for crate in CRATES),
-    *((Path(package), python_imports) for package in PACKAGES),
+    *((Path(package), imports) for package in PACKAGES for imports in (python_imports, room_imports)),
 ]:
     try:
         TopologicalSorter(imports(folder)).prepare()
     except CycleError as error:
         failed = True
         print(
-            f"{folder}: files import each other in a cycle:",
+            f"{folder}: its parts import each other in a cycle:",
             " <- ".join("/".join(name) or "lib" for name in error.args[1]),
         )
 sys.exit(failed)

@@ -12,7 +12,7 @@ import pytest
 from agents_helpers import saved, settings
 from rich.table import Table
 
-from endless_gym.printable import printable
+from endless_gym.program.printable import printable
 from endless_gym_agents.common import command, tables
 from endless_gym_agents.evaluation import export, protocol
 from endless_gym_agents.training import checkpoint, train

@@ -17,7 +17,7 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from endless_gym.printable import printable, printable_lines
+from endless_gym.program.printable import printable, printable_lines
 from endless_gym_agents.common import ranges
 
 T = TypeVar("T")

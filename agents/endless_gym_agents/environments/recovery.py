@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import EngineLost
-from endless_gym.results import Step
+from endless_gym.requests.results import Step
 from endless_gym.vector import EndlessVectorEnv
 
 T = TypeVar("T")

@@ -15,7 +15,7 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from endless_gym.create import make_vec
-from endless_gym.results import Step
+from endless_gym.requests.results import Step
 from endless_gym.vector import EndlessVectorEnv
 from endless_gym_agents.common import own
 from endless_gym_agents.environments.recovery import RecoverableEngine

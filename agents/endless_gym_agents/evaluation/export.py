@@ -24,7 +24,7 @@ import tyro
 
 from endless_gym._native import PAGE_AGENTS
 from endless_gym.create import make_vec
-from endless_gym.printable import printable
+from endless_gym.program.printable import printable
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common import atomic, command

@@ -22,7 +22,7 @@ from typing import Literal
 
 import tyro
 
-from endless_gym.printable import printable
+from endless_gym.program.printable import printable
 from endless_gym_agents.common import atomic, command
 from endless_gym_agents.common.palette import AGENTS
 from endless_gym_agents.common.ranges import Natural

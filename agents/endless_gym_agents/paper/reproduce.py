@@ -24,7 +24,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from endless_gym.printable import printable
+from endless_gym.program.printable import printable
 from endless_gym_agents.common import command, tables
 from endless_gym_agents.common.clock import duration
 from endless_gym_agents.common.ranges import Natural, Positive, Range

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from endless_gym.printable import printable
+from endless_gym.program.printable import printable
 from endless_gym_agents.common import atomic
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.training import checkpoint

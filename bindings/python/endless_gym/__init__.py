@@ -22,14 +22,14 @@ if "free-threading" in sys.version:
     )
 
 from endless_gym._native import __version__, running_engines
+from endless_gym.display.window import WindowClosed
 from endless_gym.env import Env
-from endless_gym.exceptions import EngineLost, TooManyBatchesHeld
 from endless_gym.experts import Experts
 from endless_gym.interop import DLPackView, torch_view
 from endless_gym.registration import register, register_envs
 from endless_gym.replay import ReplayStep, replay
+from endless_gym.requests.exceptions import EngineLost, TooManyBatchesHeld
 from endless_gym.specs import Frames, all_specs, spec
-from endless_gym.window import WindowClosed
 
 if TYPE_CHECKING:
     from endless_gym.create import connect, make_vec

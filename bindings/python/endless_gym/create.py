@@ -9,7 +9,10 @@ from typing import Any
 from endless_gym import _native
 from endless_gym.arguments import named
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import (
+from endless_gym.display.rendering import VECTOR_MODES, View, checked_view
+from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
+from endless_gym.interop import PageLocks, cuda_to_pin, page_locked_bytes
+from endless_gym.requests.configuration import (
     INSTEAD,
     MODES,
     AutoresetMode,
@@ -18,10 +21,7 @@ from endless_gym.configuration import (
     checked_arguments,
     options_list,
 )
-from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
-from endless_gym.interop import PageLocks, cuda_to_pin, page_locked_bytes
-from endless_gym.rendering import VECTOR_MODES, View, checked_view
-from endless_gym.results import Results
+from endless_gym.requests.results import Results
 from endless_gym.specs import Frames, ObservationName, described_spec, json_text
 from endless_gym.vector import EndlessVectorEnv
 

@@ -16,12 +16,12 @@ from typing import Any
 from endless_gym import _native
 from endless_gym.arguments import integer, named
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import INSTEAD, AutoresetMode, AutoresetName, Options, checked_arguments
 from endless_gym.create import connect
-from endless_gym.engine_log import EngineLog, level
+from endless_gym.display.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.episodes import EpisodeOptions, validate_episode_options
 from endless_gym.program import program
-from endless_gym.rendering import VECTOR_MODES, View, checked_view
+from endless_gym.program.engine_log import EngineLog, level
+from endless_gym.requests.configuration import INSTEAD, AutoresetMode, AutoresetName, Options, checked_arguments
 from endless_gym.specs import Frames, ObservationName, json_text, spec
 from endless_gym.vector import EndlessVectorEnv
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
-from endless_gym.descriptions import documented, metadata
-from endless_gym.keyboard import keys_to_action
-from endless_gym.rendering import SINGLE_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.display.descriptions import documented, metadata
+from endless_gym.display.keyboard import keys_to_action
+from endless_gym.display.rendering import SINGLE_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.display.window import Window, WindowClosed
 from endless_gym.specs import Frames, ObservationName, all_specs, contents, json_text, options_text, spec
-from endless_gym.window import Window, WindowClosed
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import mapping
-from endless_gym.configuration import AutoresetMode
-from endless_gym.next_options import NextOptions, Options, RunningEpisode, running_episodes
-from endless_gym.results import Results, Step
+from endless_gym.requests.configuration import AutoresetMode
+from endless_gym.requests.next_options import NextOptions, Options, RunningEpisode, running_episodes
+from endless_gym.requests.results import Results, Step
 from endless_gym.vector import EndlessVectorEnv
 
 #: Chooses the options of an environment's next episode. It is called with the number of the environment over all groups, the

@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium.wrappers.vector
 
-from endless_gym.configuration import AutoresetMode
+from endless_gym.requests.configuration import AutoresetMode
 
 
 class RecordEpisodeStatistics(gymnasium.wrappers.vector.RecordEpisodeStatistics):

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import Options
-from endless_gym.descriptions import documented, metadata
-from endless_gym.exceptions import TooManyBatchesHeld
+from endless_gym.display.descriptions import documented, metadata
+from endless_gym.display.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.interop import PageLocks
-from endless_gym.next_options import NextOptions, RunningEpisode, running_episodes
-from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
-from endless_gym.reset_requests import ResetRequests, Seeds
-from endless_gym.results import Results, Step
+from endless_gym.requests.configuration import Options
+from endless_gym.requests.exceptions import TooManyBatchesHeld
+from endless_gym.requests.next_options import NextOptions, RunningEpisode, running_episodes
+from endless_gym.requests.reset_requests import ResetRequests, Seeds
+from endless_gym.requests.results import Results, Step
 from endless_gym.specs import all_specs
 
 

@@ -13,7 +13,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.create import specified_results
-from endless_gym.exceptions import EngineLost
+from endless_gym.requests.exceptions import EngineLost
 
 
 class WatchedBatch(NamedTuple):

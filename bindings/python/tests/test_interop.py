@@ -10,7 +10,7 @@ from support import WHERE, engine_of_program, same
 
 import endless_gym
 from endless_gym import interop
-from endless_gym.configuration import checked_arguments
+from endless_gym.requests.configuration import checked_arguments
 from endless_gym.specs import json_text
 
 torch = pytest.importorskip("torch")

@@ -14,7 +14,7 @@ from support import MEMORY_GYM, WHERE, same
 from wrappers import SHORT, recorded
 
 import endless_gym
-from endless_gym.window import Window
+from endless_gym.display.window import Window
 
 __all__ = ["recorded"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from endless_gym.configuration import MODES, AutoresetName
+from endless_gym.requests.configuration import MODES, AutoresetName
 from endless_gym.specs import OBSERVATIONS, ObservationName
 
 SCRIPTS = Path(__file__).parent / "typed"

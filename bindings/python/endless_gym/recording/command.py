@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from endless_gym.printable import printable
+from endless_gym.program.printable import printable
 from endless_gym.recording.recorder import Recording, record
 from endless_gym.specs import Frames
 

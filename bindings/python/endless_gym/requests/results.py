@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.configuration import AutoresetMode
+from endless_gym.requests.configuration import AutoresetMode
 from endless_gym.specs import Frames, Spec
 
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]

@@ -9,7 +9,7 @@ import subprocess
 import threading
 from collections import deque
 
-from endless_gym.printable import printable
+from endless_gym.program.printable import printable
 
 _logger = logging.getLogger("endless_gym.engine")
 

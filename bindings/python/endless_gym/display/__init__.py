@@ -1,0 +1,1 @@
+"""What people see and press: rendered views, the window, keys, and the meanings of numbers."""

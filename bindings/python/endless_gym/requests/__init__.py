@@ -1,0 +1,1 @@
+"""What vector environments are asked for, and their results: configuration, resets, options and steps."""
