@@ -66,6 +66,8 @@ fn versions() -> Result<(), String> {
     let expected = [
         ("CITATION.cff", format!("\nversion: {version}\n")),
         ("agents/pyproject.toml", format!("\nversion = \"{version}\"\n")),
+        ("agents/pyproject.toml", format!("\n    \"endless-gym=={version}\",\n")),
+        ("agents/pyproject.toml", format!("\nname = \"endless-gym\"\nversion = \"{version}\"\n")),
         ("README.md", rust.clone()),
         ("CONTRIBUTING.md", rust.clone()),
         ("bindings/python/README.md", rust),
