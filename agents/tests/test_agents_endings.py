@@ -77,7 +77,9 @@ def test_weights_that_are_not_finite_are_refused(
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, *(pytest.param(each, marks=pytest.mark.slow) for each in (signal.SIGINT, signal.SIGHUP))]
 )
-def test_a_signal_stops_a_run_after_its_update_with_a_checkpoint(number: signal.Signals, tmp_path: Path) -> None:
+def test_a_signal_stops_a_run_after_its_update_with_a_checkpoint(
+    number: signal.Signals, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = [signal.getsignal(each) for each in STOP_SIGNALS]
     for attempt in range(3):
         # From another process, at any moment of an update. Schedulers and terminals may send several signals at once.
@@ -92,6 +94,7 @@ def test_a_signal_stops_a_run_after_its_update_with_a_checkpoint(number: signal.
         rows = read_progress(run)
         assert 1 < len(rows) < 100_000
         assert checkpoint.load(run).update == rows[-1]["update"] == len(rows)
+        assert f"{len(rows)} of 100000 updates done" in capsys.readouterr().out
     assert [signal.getsignal(each) for each in STOP_SIGNALS] == before
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import stat
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -71,20 +70,6 @@ def test_webp_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.Captu
     assert [file.name for file in tmp_path.iterdir()] == ["video.webp"]
 
 
-def test_webp_shows_every_pixel(tmp_path: Path) -> None:
-    agent = make_agent(settings("none", env=GRID), spec(GRID))
-    frames = list(enjoy.EpisodeRecorder(agent, 0, max_steps=12).frames((5,)))
-    # Random noise contains every colour, and hardly any equal neighbours.
-    frames.append(np.random.default_rng(0).integers(256, size=frames[0].shape, dtype=np.uint8))
-    video.write(tmp_path / "video.webp", frames, 25)
-    with Image.open(tmp_path / "video.webp") as image:
-        assert image.n_frames == len(frames)
-        for place, frame in enumerate(frames):
-            image.seek(place)
-            assert np.array_equal(rgb(image), frame), place
-            assert image.info["duration"] == 40
-
-
 def test_video_is_reproducible() -> None:
     agent = make_agent(settings("none", env=GRID), spec(GRID))
     one, two, other = (
@@ -93,24 +78,6 @@ def test_video_is_reproducible() -> None:
     )
     assert np.array_equal(one, two)
     assert one.shape != other.shape or not np.array_equal(one, other)
-
-
-def test_mp4_is_piped_to_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stub in place of ffmpeg stores its input and its arguments."""
-    program = tmp_path / "bin" / "ffmpeg"
-    program.parent.mkdir()
-    program.write_text('#!/bin/sh\necho "$@" > "$(dirname "$0")/called"\nfor last; do :; done\nexec cat > "$last"\n')
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
-    pictures = [np.full((video.HEIGHT, video.WIDTH, 3), value, np.uint8) for value in (1, 2, 3)]
-    video.write(tmp_path / "video.mp4", pictures, 25)
-    assert (tmp_path / "video.mp4").read_bytes() == np.stack(pictures).tobytes()
-    assert f"-s {video.WIDTH}x{video.HEIGHT} -r 25 -i -" in (program.parent / "called").read_text()
-
-    program.write_text("#!/bin/sh\ncat > /dev/null\necho no such encoder >&2\nexit 1\n")
-    with pytest.raises(OSError, match="no such encoder"):
-        video.write(tmp_path / "other.mp4", pictures, 25)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["bin", "video.mp4"]
 
 
 @pytest.mark.parametrize(

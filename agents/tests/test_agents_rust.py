@@ -2,7 +2,6 @@
 
 import json
 import re
-import resource
 import signal
 import struct
 import subprocess
@@ -213,27 +212,6 @@ def test_signals_end_a_run_with_a_checkpoint_and_a_killed_one_resumes(tmp_path: 
     with locked(run):
         assert "in use by process" in learn(f"--resume {run} --ppo.updates 1", fails=True)
     assert f"{updates} of 1 updates done" in learn(f"--resume {run} --ppo.updates 1")
-
-
-def test_a_full_disk_leaves_the_former_checkpoint(tmp_path: Path) -> None:
-    # With few rows, so that with the last limit the checkpoint is what cannot be written.
-    run, last = new_run(tmp_path / "run", "--ppo.updates 1 --no-keep-checkpoints"), 1
-    file = run / "checkpoints" / "last.safetensors"
-    former = file.read_bytes()
-    for limit in (0, 1, len(former) // 2):
-        process = subprocess.run(
-            [*PROGRAM, "--resume", str(run), "--ppo.updates", str(last + 1)],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),  # noqa: B023
-        )
-        assert process.returncode == 1 and "File too large" in process.stderr.splitlines()[-1], process.stderr
-        assert file.read_bytes() == former
-    assert file.name in process.stderr
-    assert {each.name for each in file.parent.iterdir()} == {file.name}
-    learn(f"--resume {run} --ppo.updates {last + 1}")
-    assert checkpoint.load(run).update == last + 1
 
 
 @contextmanager

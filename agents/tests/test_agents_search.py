@@ -16,7 +16,6 @@ from endless_gym_agents.paper.search import parse
 from endless_gym_agents.paper.search_space import single_changes, space, with_choices
 from endless_gym_agents.paper.search_study import SearchArguments, Trials
 from endless_gym_agents.settings import PRESETS, Settings, value
-from endless_gym_agents.training.train import train
 
 QUIET = Console(quiet=True)
 
@@ -32,12 +31,6 @@ def small(folder: Path, **changes: Any) -> SearchArguments:
 
 def states(trials: Trials) -> list[str]:
     return [trial.state.name for trial in trials.study.trials]
-
-
-def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
-    """Final and intermediate rewards of the complete trials, by their number of epochs."""
-    done = [trial for trial in trials.study.trials if trial.state.name == "COMPLETE"]
-    return {trial.params["ppo.epochs"]: (trial.value, trial.intermediate_values) for trial in done}
 
 
 def test_search_space_is_the_table_of_the_paper() -> None:
@@ -131,29 +124,6 @@ def test_no_trial_is_begun_after_the_time_limit(tmp_path: Path) -> None:
     search.run_trials(trials)
     assert states(trials) == ["WAITING"] * 3
     assert Trials(small(tmp_path, stage="single"), QUIET).remaining() == (0, 3)
-
-
-@pytest.mark.slow
-def test_interrupted_trial_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search that is interrupted after the first update has the same results as an uninterrupted search."""
-    through = Trials(small(tmp_path / "through", stage="single"), QUIET)
-    search.run_trials(through)
-
-    def stopped(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
-        return train(given, lambda update, means: watch(update, means) or update == 1)
-
-    monkeypatch.setattr(search, "train", stopped)
-    broken = Trials(small(tmp_path / "broken", stage="single"), QUIET)
-    with pytest.raises(KeyboardInterrupt):
-        search.run_trials(broken)
-    assert states(broken) == ["RUNNING", "WAITING", "WAITING"]
-    monkeypatch.setattr(search, "train", train)
-    resumed = Trials(small(tmp_path / "broken", stage="single"), QUIET)
-    search.run_trials(resumed)
-    assert states(resumed) == ["COMPLETE"] * 3
-
-    assert values(resumed) == values(through)
-    assert not (tmp_path / "broken" / "trial-0003").exists()
 
 
 @pytest.mark.parametrize(

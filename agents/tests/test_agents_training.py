@@ -2,11 +2,7 @@
 
 import json
 import os
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +16,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from endless_gym import make_vec
 from endless_gym_agents.common.clock import Clock
-from endless_gym_agents.common.command import STOP_SIGNALS
 from endless_gym_agents.environments.groups import Environments
 from endless_gym_agents.evaluation.evaluate import evaluate, mean
 from endless_gym_agents.settings import PRESETS, Settings
@@ -110,36 +105,6 @@ def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
     given = ({}, {"num_threads": 3}, {"engine": "process"})
     one, *others = (train(small("gru", tmp_path / str(n), 3, **changes)) for n, changes in enumerate(given))
     assert [progress(other) for other in others] == [progress(one)] * 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "engine"), [*zip(STOP_SIGNALS, ["process", "thread", "process"], strict=True)])
-def test_a_signal_writes_a_checkpoint_and_frees_shared_memory(
-    number: signal.Signals, engine: str, tmp_path: Path, segments: Callable[[], set[str]]
-) -> None:
-    run = tmp_path / "run"
-    before = segments()
-    arguments = f"--env {GRID} --agent gru --preset quick --run {run} --threads 1 --environment.engine {engine}"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "endless_gym_agents.train", *arguments.split()],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
-    end = time.monotonic() + 120
-    while not (run / "progress.jsonl").exists() or not (run / "progress.jsonl").read_text():
-        assert process.poll() is None and time.monotonic() < end
-        time.sleep(0.1)
-    process.send_signal(number)
-    output, _ = process.communicate(timeout=60)
-    assert process.returncode == 0, output
-    assert "stopping after this update" in output
-    done = checkpoint.load(run).update
-    assert 1 <= done < 2000
-    assert f"{done} of 2000 updates done" in output
-    assert len(progress(run)) == done
-    assert segments() <= before
 
 
 def test_a_function_chooses_the_options_of_training_episodes(tmp_path: Path) -> None:
