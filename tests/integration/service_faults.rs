@@ -6,7 +6,7 @@
 
 use std::fs::{self, File, Permissions};
 use std::io::Write;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -86,19 +86,6 @@ fn an_unusable_counter_of_a_dead_process_is_replaced() {
     let _engine = place.engine("gym", 2, 1);
     play(&mut place.trainer("gym").unwrap(), 0, 1);
     assert_eq!(counters().count(), 0);
-}
-
-#[test]
-fn no_segment_is_open_to_other_users() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 1);
-    let mut trainer = place.trainer("gym").unwrap();
-    play(&mut trainer, 0, 1);
-    let segments = place.segments();
-    assert!(!segments.is_empty());
-    for segment in segments {
-        assert_eq!(fs::metadata(&segment).unwrap().mode() & 0o077, 0, "{}", segment.display());
-    }
 }
 
 #[test]

@@ -177,15 +177,6 @@ class TestStableBaselines3:
                 return
         pytest.fail("no episode ended")
 
-    def test_seeds_and_options_apply_to_the_next_reset(self):
-        venv = self.make(SHORT, num_envs=2)
-        venv.seed(5)
-        venv.set_options({"command_show_duration": [2]})
-        first = venv.reset()
-        venv.seed(5)
-        np.testing.assert_array_equal(first, venv.reset())
-        venv.close()
-
     def test_wrappers_and_ppo_accept_the_adapter(self):
         from stable_baselines3 import PPO
         from stable_baselines3.common.evaluation import evaluate_policy

@@ -4,7 +4,6 @@ import gc
 import logging
 import os
 import random
-import resource
 import shutil
 import signal
 import subprocess
@@ -356,28 +355,6 @@ def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
         endless_gym.serve(ID, resume=True)
     with endless_gym.serve(ID) as envs, pytest.raises(RuntimeError, match="no checkpoint file"):
         envs.checkpoint()
-
-
-def test_a_full_disk_leaves_the_former_checkpoint(tmp_path: Path) -> None:
-    file = tmp_path / "state"
-    with endless_gym.serve(ID, 4, checkpoint=file, checkpoint_every=3600.0) as envs:
-        envs.reset(seed=1)
-        envs.step(ACTIONS)
-        assert envs.checkpoint() == [2]
-        former = file.read_bytes()
-        for limit in (0, 1, len(former) // 2):
-            resource.prlimit(envs._engine.pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-            with pytest.raises(RuntimeError, match=r"state cannot be written.*File too large"):
-                envs.checkpoint()
-            assert file.read_bytes() == former
-            # The engine plays on.
-            envs.step(ACTIONS)
-        resource.prlimit(envs._engine.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        assert envs.checkpoint() == [5] and file.read_bytes() != former
-        os.kill(envs._engine.pid, signal.SIGKILL)
-    file.write_bytes(former)
-    with endless_gym.serve(ID, 4, checkpoint=file, resume=True) as envs:
-        assert [group.step for group in envs.reconnect().groups] == [2]
 
 
 def test_an_engine_killed_while_it_saves_leaves_a_whole_checkpoint(tmp_path: Path) -> None:
