@@ -13,6 +13,7 @@ pub mod mystery_path;
 mod screen;
 pub mod searing_spotlights;
 mod shared_methods;
+mod typed_parameters;
 mod vector;
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 //!
 //! Source: `default_reset_parameters` and `process_reset_params` of the original.
 
+use crate::typed_parameters::{type_of, typed_parameters};
 use endless_gym_core::envs::ResetParameters;
 
 /// Distinguishes the ids of Mystery Path.
@@ -22,75 +23,30 @@ pub const MAX_AGENT_SCALE: f64 = 4.0;
 /// Maximum `stamina_level`.
 pub const MAX_STAMINA: i64 = 1_000_000_000;
 
-/// One set of reset parameters.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Parameters {
-    /// Maximum steps per episode; unlimited if less than 1.
-    pub max_steps: i64,
-    /// Size of the agent, 0 to 4; 0.25 is a radius of 6 pixels.
-    pub agent_scale: f64,
-    /// Pixels per step, 0 to 84. Unused on a grid.
-    pub agent_speed: f64,
-    /// Sides on which the path may start, to draw from: 0 left, 1 right, 2 top, 3 bottom. Empty for the endless id.
-    pub cardinal_origin_choice: Vec<i64>,
-    /// Whether the path's first tile is shown.
-    pub show_origin: bool,
-    /// Whether the path's last tile is shown.
-    pub show_goal: bool,
-    /// Whether the path behind the endless agent is shown.
-    pub show_past_path: bool,
-    /// Whether a tiled background scrolls with the endless agent.
-    pub show_background: bool,
-    /// Whether a bar shows the endless agent's stamina.
-    pub show_stamina: bool,
-    /// Whether a red cross shows that the agent fell off the path.
-    pub visual_feedback: bool,
-    /// Number of tiles on the screen to the left of the endless agent, limited to 0 to 5.5; truncated, the number of past
-    /// columns that are shown.
-    pub camera_offset_scale: f64,
-    /// Steps within which the endless agent must reach the next tile, at least 1.
-    pub stamina_level: i64,
-    /// Reward for reaching the goal.
-    pub reward_goal: f64,
-    /// Reward for falling off the path.
-    pub reward_fall_off: f64,
-    /// Reward for reaching a tile of the path for the first time in the episode.
-    pub reward_path_progress: f64,
-    /// Reward for reaching a tile of the path for the first time since the last fall.
-    pub reward_path_progress_dense: f64,
-    /// Reward for each step.
-    pub reward_step: f64,
-}
-
-impl Parameters {
-    /// Reads the parameters of the family from a checked set.
-    pub fn new(variant: Variant, given: &ResetParameters) -> Self {
-        Parameters {
-            max_steps: given.int("max_steps", -1),
-            agent_scale: match variant {
-                // The grid id has the parameter, but the original draws its agent at the default scale.
-                Variant::Grid => DEFAULT_AGENT_SCALE,
-                Variant::Free | Variant::Endless => given.float("agent_scale", DEFAULT_AGENT_SCALE),
-            },
-            agent_speed: given.float("agent_speed", 0.0),
-            cardinal_origin_choice: given.int_list("cardinal_origin_choice"),
-            show_origin: match variant {
-                Variant::Free | Variant::Grid => given.bool("show_origin", false),
-                // The original requires `show_origin` to be both true and false, so the endless id never shows it.
-                Variant::Endless => false,
-            },
-            show_goal: given.bool("show_goal", false),
-            show_past_path: given.bool("show_past_path", false),
-            show_background: given.bool("show_background", false),
-            show_stamina: given.bool("show_stamina", false),
-            visual_feedback: given.bool("visual_feedback", true),
-            camera_offset_scale: given.float("camera_offset_scale", 0.0),
-            stamina_level: given.int("stamina_level", 1),
-            reward_goal: given.float("reward_goal", 0.0),
-            reward_fall_off: given.float("reward_fall_off", 0.0),
-            reward_path_progress: given.float("reward_path_progress", 0.0),
-            reward_path_progress_dense: given.float("reward_path_progress_dense", 0.0),
-            reward_step: given.float("reward_step", 0.0),
-        }
-    }
+typed_parameters! {
+    variant, given;
+    max_steps: int(-1),
+    agent_speed: float(0.0),
+    cardinal_origin_choice: int_list(),
+    show_goal: bool(false),
+    show_past_path: bool(false),
+    show_background: bool(false),
+    show_stamina: bool(false),
+    visual_feedback: bool(true),
+    camera_offset_scale: float(0.0),
+    stamina_level: int(1),
+    reward_goal: float(0.0),
+    reward_fall_off: float(0.0),
+    reward_path_progress: float(0.0),
+    reward_path_progress_dense: float(0.0),
+    reward_step: float(0.0),
+    ;
+    /// Size of the agent. The grid id has the parameter, but the original draws its agent at the default scale.
+    agent_scale: f64 = match variant {
+        Variant::Grid => DEFAULT_AGENT_SCALE,
+        Variant::Free | Variant::Endless => given.float("agent_scale", DEFAULT_AGENT_SCALE),
+    },
+    /// Whether the path's first tile is shown. The original's endless id requires `show_origin` to be both true and false, so it never
+    /// shows it.
+    show_origin: bool = variant != Variant::Endless && given.bool("show_origin", false),
 }
