@@ -46,30 +46,3 @@ impl Ledger {
         found
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn faults(batches: &[(u64, u64)]) -> usize {
-        let mut ledger = Ledger::default();
-        batches.iter().for_each(|(trainer, step)| ledger.add(7, 0, *trainer, *step));
-        ledger.faults().len()
-    }
-
-    #[test]
-    fn each_trainer_may_leave_one_batch_unreported() {
-        assert_eq!(faults(&[(0, 1), (0, 2), (1, 3)]), 0);
-        assert_eq!(faults(&[(0, 1), (0, 2), (1, 4)]), 0);
-        assert_eq!(faults(&[(0, 1), (0, 2), (1, 5)]), 1);
-        assert_eq!(faults(&[(0, 1), (0, 2), (2, 5)]), 0);
-        assert_eq!(faults(&[(0, 1), (0, 2), (1, 2)]), 1);
-        assert_eq!(faults(&[(1, 2)]), 0);
-        assert_eq!(faults(&[(1, 3)]), 1);
-    }
-
-    #[test]
-    fn reports_may_be_read_late() {
-        assert_eq!(faults(&[(0, 1), (1, 4), (0, 2), (1, 5), (0, 3)]), 0);
-    }
-}

@@ -189,24 +189,3 @@ fn fault(draws: &mut Generator, owns_memory: bool) -> Fault {
         _ => Fault::OtherUser,
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use std::collections::BTreeSet;
-
-    use super::*;
-
-    #[test]
-    fn a_plan_depends_on_seed_and_round() {
-        assert_eq!(Plan::new(1, 5), Plan::new(1, 5));
-        assert_ne!(Plan::new(1, 5), Plan::new(1, 6));
-        assert_ne!(Plan::new(1, 5), Plan::new(2, 5));
-    }
-
-    #[test]
-    fn every_kind_of_fault_occurs() {
-        let kinds: BTreeSet<_> =
-            (0..400).flat_map(|round| Plan::new(1, round).steps).map(|step| step.fault.kind()).collect();
-        assert_eq!(kinds.len(), 31, "{kinds:?}");
-    }
-}

@@ -355,18 +355,3 @@ fn summary(args: &Args, seed: u64, time: Duration, phases: &[Phase]) -> Result<(
     }
     if failures == 0 { Ok(()) } else { Err(format!("{failures} failures; seed {seed}")) }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn steady_growth_is_found_and_fluctuation_is_not() {
-        let usages = |memory: fn(u64) -> u64| -> Vec<Usage> {
-            (0..90).map(|at| Usage { engine_memory: memory(at) << 20, ..Usage::default() }).collect()
-        };
-        assert_eq!(Usage::growth(&usages(|at| 100 + at), MEMORY).len(), 1);
-        assert!(Usage::growth(&usages(|at| 100 + 50 * (at % 5)), MEMORY).is_empty());
-        assert!(Usage::growth(&usages(|at| 100 + 5 * at.min(36)), MEMORY).is_empty());
-    }
-}
