@@ -3,14 +3,12 @@
 use std::collections::HashSet;
 
 use crate::support::player::{Player, random_actions};
-use crate::support::recorded::{options as any_options, property_cases};
 use endless_gym::envs::ActionError;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
     Autoreset, EnvReset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
 use endless_gym_memory_gym::FRAME;
-use proptest::prelude::*;
 use rand::SeedableRng;
 use rand::rngs::SmallRng;
 use serde_json::{Map, Value as Json, json};
@@ -314,26 +312,4 @@ fn wrong_calls_are_refused_and_change_nothing() {
     let request = ResetRequest::Each(&[EnvReset::Next]);
     assert!(matches!(pool.reset(request, &mut blocks), Err(PoolError::ResetCount { .. })));
     assert!(bytemuck::cast_slice::<_, u8>(&before) == bytemuck::cast_slice::<_, u8>(&blocks));
-}
-
-proptest! {
-    #![proptest_config(property_cases(64))]
-
-    /// With any options within the limits, any seed and any actions, nothing panics, and two pools agree.
-    #[test]
-    fn any_options_within_the_limits_can_be_played(
-        (spec, given) in prop::sample::select(memory_gym().specs().collect::<Vec<_>>())
-            .prop_flat_map(|spec| (Just(spec), any_options(spec))),
-        seed: u64,
-    ) {
-        let config = PoolConfig::new(spec.id, 3).options(ResetOptions::Shared(given)).seeding(Seeding::Continue { seed: Some(seed) }).features(true);
-        let mut players = [1, 2].map(|threads| Player::with_threads(&config, threads));
-        players.iter_mut().for_each(|player| player.reset(ResetRequest::All));
-        let mut random = SmallRng::seed_from_u64(5);
-        for _ in 0..60 {
-            let actions = random_actions(spec, 3, &mut random);
-            players.iter_mut().for_each(|player| player.step(&actions));
-            prop_assert!(players[0].bytes() == players[1].bytes());
-        }
-    }
 }
