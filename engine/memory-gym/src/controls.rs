@@ -1,6 +1,6 @@
-//! What several ids share: the meaning of their actions, and specifications with them.
+//! What several ids share: the meaning of their actions, and parts of their specifications.
 
-use endless_gym_core::envs::{ActionBranch, ActionSpace, Choice, EnvSpec, Parameter};
+use endless_gym_core::envs::{ActionBranch, ActionSpace, Choice, Column, EnvSpec, InfoColumn, Parameter};
 
 use crate::screen::FRAME;
 
@@ -18,6 +18,21 @@ pub(crate) fn spec(id: &'static str, summary: &'static str, actions: &'static [A
 /// The step limit of an id.
 pub(crate) const fn max_steps(default: i64) -> Parameter {
     Parameter::int("max_steps", default, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1.")
+}
+
+/// A column of the ground truth or of the features.
+pub(crate) const fn column(name: &'static str, description: &'static str) -> Column {
+    Column { name, description }
+}
+
+/// A column of the final info with a Python int.
+pub(crate) const fn integer(name: &'static str, description: &'static str) -> InfoColumn {
+    InfoColumn { name, is_integer: true, description }
+}
+
+/// A column of the final info with a float.
+pub(crate) const fn float(name: &'static str, description: &'static str) -> InfoColumn {
+    InfoColumn { name, is_integer: false, description }
 }
 
 const fn choice(name: &'static str, description: &'static str) -> Choice {

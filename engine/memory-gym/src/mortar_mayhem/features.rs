@@ -3,6 +3,7 @@
 use super::commands::COMMANDS;
 use super::config::Config;
 use super::state::State;
+use crate::controls::column;
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Column;
 
@@ -20,23 +21,23 @@ pub(super) const LARGEST_ARENA: f32 = 6.0;
 
 /// The columns of the feature observation.
 pub const FEATURES: &[Column] = &[
-    Column { name: "agent_x", description: "x of the agent's centre as a share of the screen's width" },
-    Column { name: "agent_y", description: "y of the agent's centre as a share of the screen's height" },
-    Column { name: "heading_x", description: "x of the agent's heading, a unit vector" },
-    Column { name: "heading_y", description: "y of the agent's heading, a unit vector" },
-    Column { name: "command_right", description: "1 while this command is shown" },
-    Column { name: "command_down", description: "1 while this command is shown" },
-    Column { name: "command_left", description: "1 while this command is shown" },
-    Column { name: "command_up", description: "1 while this command is shown" },
-    Column { name: "command_stay", description: "1 while this command is shown" },
-    Column { name: "command_right_down", description: "1 while this command is shown" },
-    Column { name: "command_right_up", description: "1 while this command is shown" },
-    Column { name: "command_left_down", description: "1 while this command is shown" },
-    Column { name: "command_left_up", description: "1 while this command is shown" },
-    Column { name: "burning", description: "1 while tiles are red" },
-    Column { name: "safe_x", description: "column of the tile that is not red, divided by 5; 0 while none is red" },
-    Column { name: "safe_y", description: "row of the tile that is not red, divided by 5; 0 while none is red" },
-    Column { name: "arena_size", description: "tiles along a side of the arena, divided by 6" },
+    column("agent_x", "x of the agent's centre as a share of the screen's width"),
+    column("agent_y", "y of the agent's centre as a share of the screen's height"),
+    column("heading_x", "x of the agent's heading, a unit vector"),
+    column("heading_y", "y of the agent's heading, a unit vector"),
+    column("command_right", "1 while this command is shown"),
+    column("command_down", "1 while this command is shown"),
+    column("command_left", "1 while this command is shown"),
+    column("command_up", "1 while this command is shown"),
+    column("command_stay", "1 while this command is shown"),
+    column("command_right_down", "1 while this command is shown"),
+    column("command_right_up", "1 while this command is shown"),
+    column("command_left_down", "1 while this command is shown"),
+    column("command_left_up", "1 while this command is shown"),
+    column("burning", "1 while tiles are red"),
+    column("safe_x", "column of the tile that is not red, divided by 5; 0 while none is red"),
+    column("safe_y", "row of the tile that is not red, divided by 5; 0 while none is red"),
+    column("arena_size", "tiles along a side of the arena, divided by 6"),
 ];
 
 impl State {

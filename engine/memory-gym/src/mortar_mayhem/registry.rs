@@ -8,7 +8,7 @@ use super::features::FEATURES;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION, Variant};
 use std::sync::LazyLock;
 
-use crate::controls::{MOVE, TURN_AND_WALK, max_steps, spec};
+use crate::controls::{MOVE, TURN_AND_WALK, column, float, integer, max_steps, spec};
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Learnt, Metric, Parameter};
 
 const AGENT_SCALE: Parameter = Parameter::float(
@@ -96,16 +96,8 @@ const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
 ];
 
 const FINITE_INFO: &[InfoColumn] = &[
-    InfoColumn {
-        name: "success",
-        is_integer: true,
-        description: "1 if the last command was reached, even if the agent failed at it, as in the original",
-    },
-    InfoColumn {
-        name: "commands_completed",
-        is_integer: false,
-        description: "share of the commands that were executed, 0 to 1",
-    },
+    integer("success", "1 if the last command was reached, even if the agent failed at it, as in the original"),
+    float("commands_completed", "share of the commands that were executed, 0 to 1"),
     InfoColumn {
         description: "share of the commands that were executed, 0 to 1, without a failed last command",
         ..InfoColumn::TASK_PROGRESS
@@ -113,20 +105,13 @@ const FINITE_INFO: &[InfoColumn] = &[
 ];
 
 const ENDLESS_INFO: &[InfoColumn] = &[
-    InfoColumn { name: "commands_completed", is_integer: true, description: "commands executed in the episode" },
-    InfoColumn {
-        name: "max_command_sequence",
-        is_integer: true,
-        description: "length of the longest sequence executed",
-    },
+    integer("commands_completed", "commands executed in the episode"),
+    integer("max_command_sequence", "length of the longest sequence executed"),
 ];
 
 const GROUND_TRUTH: &[Column] = &[
-    Column {
-        name: "target_x",
-        description: "column of the tile that the current command leads to, from the left, divided by 5",
-    },
-    Column { name: "target_y", description: "row of that tile, from the top, divided by 5" },
+    column("target_x", "column of the tile that the current command leads to, from the left, divided by 5"),
+    column("target_y", "row of that tile, from the top, divided by 5"),
 ];
 
 /// The five ids of the family.

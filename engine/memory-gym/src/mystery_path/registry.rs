@@ -7,7 +7,7 @@ use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
 use std::sync::LazyLock;
 
-use crate::controls::{FOLLOW, MOVE, TURN_AND_WALK, max_steps, spec};
+use crate::controls::{FOLLOW, MOVE, TURN_AND_WALK, column, integer, max_steps, spec};
 use crate::screen::SCREEN;
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, Parameter};
 
@@ -95,11 +95,10 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
     REWARD_STEP,
 ];
 
-const NUM_FAILS: InfoColumn =
-    InfoColumn { name: "num_fails", is_integer: true, description: "steps in which the agent was off the path" };
+const NUM_FAILS: InfoColumn = integer("num_fails", "steps in which the agent was off the path");
 
 const FINITE_INFO: &[InfoColumn] = &[
-    InfoColumn { name: "success", is_integer: true, description: "1 if the goal was reached, otherwise 0" },
+    integer("success", "1 if the goal was reached, otherwise 0"),
     NUM_FAILS,
     InfoColumn {
         description: "share of the path's tiles that were reached, 0 to 1; `success` if they have no reward",
@@ -109,25 +108,17 @@ const FINITE_INFO: &[InfoColumn] = &[
 
 const ENDLESS_INFO: &[InfoColumn] = &[
     NUM_FAILS,
-    InfoColumn {
-        name: "max_x",
-        is_integer: true,
-        description: "the farthest column of the path that the agent was on, from 0",
-    },
-    InfoColumn {
-        name: "tiles_visited",
-        is_integer: true,
-        description: "tiles of the path that the agent was on, not counting the first",
-    },
+    integer("max_x", "the farthest column of the path that the agent was on, from 0"),
+    integer("tiles_visited", "tiles of the path that the agent was on, not counting the first"),
 ];
 
 const GROUND_TRUTH: &[Column] = &[
-    Column {
-        name: "right",
-        description: "1 if the path's next tile is to the right of the last one that the agent was on, otherwise 0. Where the path leads back to the left, the last direction remains",
-    },
-    Column { name: "up", description: "1 if the next tile is above it, otherwise 0" },
-    Column { name: "down", description: "1 if the next tile is below it, otherwise 0" },
+    column(
+        "right",
+        "1 if the path's next tile is to the right of the last one that the agent was on, otherwise 0. Where the path leads back to the left, the last direction remains",
+    ),
+    column("up", "1 if the next tile is above it, otherwise 0"),
+    column("down", "1 if the next tile is below it, otherwise 0"),
 ];
 
 /// The three ids of the family.

@@ -2,6 +2,7 @@
 
 use super::config::{Config, HEALTH_WIDTH};
 use super::state::{Background, Exit, State};
+use crate::controls::column;
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Column;
 
@@ -23,77 +24,57 @@ pub(super) const SPOTLIGHT: usize = COIN + 3 * COINS;
 macro_rules! coin {
     ($number:literal) => {
         [
-            Column {
-                name: concat!("coin_", $number, "_seen"),
-                description: "1 if this coin's centre is seen; only coins that are seen are numbered",
-            },
-            Column { name: concat!("coin_", $number, "_x"), description: "x of its centre, as a share of the width" },
-            Column { name: concat!("coin_", $number, "_y"), description: "y of its centre, as a share of the height" },
+            column(
+                concat!("coin_", $number, "_seen"),
+                "1 if this coin's centre is seen; only coins that are seen are numbered",
+            ),
+            column(concat!("coin_", $number, "_x"), "x of its centre, as a share of the width"),
+            column(concat!("coin_", $number, "_y"), "y of its centre, as a share of the height"),
         ]
     };
 }
 
-macro_rules! spotlight {
-    ($number:literal) => {
-        [
-            Column {
-                name: concat!("spotlight_", $number, "_radius"),
-                description: "radius of a lit circle that overlaps the screen, as a share of the width; 0 for none",
-            },
-            Column {
-                name: concat!("spotlight_", $number, "_x"),
-                description: "x of its centre, as a share of the width; may lie off the screen",
-            },
-            Column {
-                name: concat!("spotlight_", $number, "_y"),
-                description: "y of its centre, as a share of the height; may lie off the screen",
-            },
-        ]
+macro_rules! spotlights {
+    ($($number:literal)*) => {
+        [$([
+            column(
+                concat!("spotlight_", $number, "_radius"),
+                "radius of a lit circle that overlaps the screen, as a share of the width; 0 for none",
+            ),
+            column(
+                concat!("spotlight_", $number, "_x"),
+                "x of its centre, as a share of the width; may lie off the screen",
+            ),
+            column(
+                concat!("spotlight_", $number, "_y"),
+                "y of its centre, as a share of the height; may lie off the screen",
+            ),
+        ]),*]
     };
 }
 
 const FIRST: [Column; COIN] = [
-    Column { name: "agent_seen", description: "1 if the agent's centre is seen" },
-    Column { name: "agent_x", description: "x of its centre as a share of the screen's width; 0 if not seen" },
-    Column { name: "agent_y", description: "y of its centre as a share of the screen's height; 0 if not seen" },
-    Column { name: "heading_x", description: "x of its heading, a unit vector; 0 if not seen" },
-    Column { name: "heading_y", description: "y of its heading, a unit vector; 0 if not seen" },
-    Column { name: "health", description: "green share of the health bar" },
-    Column { name: "hit", description: "1 if red tiles are seen" },
-    Column { name: "last_action_x", description: "the previous action as the bar shows it: -1 left, 1 right" },
-    Column { name: "last_action_y", description: "the previous action as the bar shows it: -1 up, 1 down" },
-    Column {
-        name: "last_reward_positive",
-        description: "1 if the bar shows that the previous step gave a positive reward",
-    },
-    Column { name: "light", description: "brightness outside the lit circles: 1 at first, 0 in the dark" },
-    Column { name: "exit_seen", description: "1 if the exit's centre is seen" },
-    Column { name: "exit_x", description: "x of its centre as a share of the screen's width; 0 if not seen" },
-    Column { name: "exit_y", description: "y of its centre as a share of the screen's height; 0 if not seen" },
-    Column { name: "exit_open", description: "1 if the exit is seen and open" },
+    column("agent_seen", "1 if the agent's centre is seen"),
+    column("agent_x", "x of its centre as a share of the screen's width; 0 if not seen"),
+    column("agent_y", "y of its centre as a share of the screen's height; 0 if not seen"),
+    column("heading_x", "x of its heading, a unit vector; 0 if not seen"),
+    column("heading_y", "y of its heading, a unit vector; 0 if not seen"),
+    column("health", "green share of the health bar"),
+    column("hit", "1 if red tiles are seen"),
+    column("last_action_x", "the previous action as the bar shows it: -1 left, 1 right"),
+    column("last_action_y", "the previous action as the bar shows it: -1 up, 1 down"),
+    column("last_reward_positive", "1 if the bar shows that the previous step gave a positive reward"),
+    column("light", "brightness outside the lit circles: 1 at first, 0 in the dark"),
+    column("exit_seen", "1 if the exit's centre is seen"),
+    column("exit_x", "x of its centre as a share of the screen's width; 0 if not seen"),
+    column("exit_y", "y of its centre as a share of the screen's height; 0 if not seen"),
+    column("exit_open", "1 if the exit is seen and open"),
 ];
 
 const COIN_COLUMNS: [[Column; 3]; COINS] =
     [coin!(0), coin!(1), coin!(2), coin!(3), coin!(4), coin!(5), coin!(6), coin!(7)];
 
-const SPOTLIGHT_COLUMNS: [[Column; 3]; SPOTLIGHTS] = [
-    spotlight!(0),
-    spotlight!(1),
-    spotlight!(2),
-    spotlight!(3),
-    spotlight!(4),
-    spotlight!(5),
-    spotlight!(6),
-    spotlight!(7),
-    spotlight!(8),
-    spotlight!(9),
-    spotlight!(10),
-    spotlight!(11),
-    spotlight!(12),
-    spotlight!(13),
-    spotlight!(14),
-    spotlight!(15),
-];
+const SPOTLIGHT_COLUMNS: [[Column; 3]; SPOTLIGHTS] = spotlights!(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15);
 
 const COUNT: usize = SPOTLIGHT + 3 * SPOTLIGHTS;
 

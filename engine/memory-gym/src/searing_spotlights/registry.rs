@@ -7,7 +7,7 @@ use super::features::FEATURES;
 use super::parameters::{MAX_AGENT_SCALE, MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use std::sync::LazyLock;
 
-use crate::controls::{MOVE, max_steps, spec};
+use crate::controls::{MOVE, column, float, integer, max_steps, spec};
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, Parameter};
 
 const fn initial_spawns(default: i64) -> Parameter {
@@ -187,46 +187,26 @@ const ENDLESS_SEARING_SPOTLIGHTS: &[Parameter] = &[
     REWARD_COIN,
 ];
 
-const AGENT_HEALTH_LEFT: InfoColumn = InfoColumn {
-    name: "agent_health",
-    is_integer: false,
-    description: "share of the health points left; 0 or less if the agent died",
-};
+const AGENT_HEALTH_LEFT: InfoColumn =
+    float("agent_health", "share of the health points left; 0 or less if the agent died");
 
 const FINITE_INFO: &[InfoColumn] = &[
     AGENT_HEALTH_LEFT,
-    InfoColumn {
-        name: "coins_collected",
-        is_integer: false,
-        description: "share of the coins that were collected, 0 to 1; NaN if the episode had no coins",
-    },
-    InfoColumn {
-        name: "success",
-        is_integer: true,
-        description: "1 if the agent collected all coins and, if there is one, left by the exit",
-    },
+    float("coins_collected", "share of the coins that were collected, 0 to 1; NaN if the episode had no coins"),
+    integer("success", "1 if the agent collected all coins and, if there is one, left by the exit"),
     InfoColumn {
         description: "share of the coins that were collected; with an exit, half of it plus half for leaving. 0 to 1",
         ..InfoColumn::TASK_PROGRESS
     },
 ];
 
-const ENDLESS_INFO: &[InfoColumn] = &[
-    AGENT_HEALTH_LEFT,
-    InfoColumn { name: "coins_collected", is_integer: true, description: "coins collected in the episode" },
-];
+const ENDLESS_INFO: &[InfoColumn] = &[AGENT_HEALTH_LEFT, integer("coins_collected", "coins collected in the episode")];
 
 const GROUND_TRUTH: &[Column] = &[
-    Column { name: "agent_x", description: "x of the agent's centre, as a share of the screen's width" },
-    Column { name: "agent_y", description: "y of the agent's centre, as a share of the screen's height" },
-    Column {
-        name: "coin_x",
-        description: "x of the coin's centre, as a share of the screen's width; 0 without a coin",
-    },
-    Column {
-        name: "coin_y",
-        description: "y of the coin's centre, as a share of the screen's height; 0 without a coin",
-    },
+    column("agent_x", "x of the agent's centre, as a share of the screen's width"),
+    column("agent_y", "y of the agent's centre, as a share of the screen's height"),
+    column("coin_x", "x of the coin's centre, as a share of the screen's width; 0 without a coin"),
+    column("coin_y", "y of the coin's centre, as a share of the screen's height; 0 without a coin"),
 ];
 
 /// The two ids of the family.
