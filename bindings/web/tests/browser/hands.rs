@@ -196,23 +196,3 @@ fn frames_per_second(milliseconds: u32) -> String {
          else done([frames / time * 1000, endless.wall.rate]) }}; requestAnimationFrame(count) }})"
     )
 }
-
-/// Prints the frames per second of walls: `cargo test --package endless-gym-web --test browser -- --ignored --nocapture measure`.
-#[test]
-#[ignore = "measures; needs the built page and Chromium"]
-fn measure_the_frames_of_walls() {
-    let (server, mut browser) = (PageServer::start("web"), start("measure"));
-    for count in [100, 250] {
-        for spec in memory_gym().specs() {
-            visit(&mut browser, &server, &format!("wall={}&count={count}&by=expert", spec.id));
-            browser.wait("endless.wall.rate !== null");
-            let rates = browser.value(&frames_per_second(4000));
-            println!(
-                "{count} {:30} {:5.1} frames, {:5.1} steps per second",
-                spec.id,
-                rates[0].as_f64().unwrap(),
-                rates[1].as_f64().unwrap()
-            );
-        }
-    }
-}
