@@ -29,9 +29,8 @@ except ImportError as error:
         "endless_gym.sb3 needs Stable-Baselines3: pip install stable-baselines3 (and sb3-contrib for RecurrentPPO)"
     ) from error
 
-from endless_gym.adapters import check_adaptable
 from endless_gym.create import make_vec
-from endless_gym.vector import EndlessVectorEnv
+from endless_gym.vector import EndlessVectorEnv, check_adaptable
 
 __all__ = ["EndlessVecEnv"]
 

@@ -26,10 +26,9 @@ except ImportError as error:
     raise ImportError("endless_gym.torchrl needs TorchRL: pip install torchrl tensordict") from error
 
 from endless_gym import torch_view
-from endless_gym.adapters import check_adaptable
 from endless_gym.create import make_vec
 from endless_gym.engine import serve
-from endless_gym.vector import EndlessVectorEnv
+from endless_gym.vector import EndlessVectorEnv, check_adaptable
 
 __all__ = ["EndlessEnv"]
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
@@ -536,3 +536,21 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def _sent_reset(self, group: int, envs: Sequence[int], given: Options, text: str | None) -> None:
         self._options.started(group, envs, given, text)
+
+
+def check_adaptable(envs: EndlessVectorEnv, autoreset: AutoresetMode, library: str) -> None:
+    """Check that a library can use vector environments.
+
+    Args:
+        envs: The vector environments.
+        autoreset: The auto-reset mode that the library requires.
+        library: Its name, for messages.
+
+    Raises:
+        ValueError: The environments have another auto-reset mode, or more than one group.
+    """
+    mode = AutoresetMode(envs.metadata["autoreset_mode"])
+    if mode is not autoreset:
+        raise ValueError(f'autoreset must be "{autoreset.name.lower()}" for {library}, got "{mode.name.lower()}"')
+    if envs.num_groups != 1:
+        raise ValueError(f"groups must be 1 for {library}, got {envs.num_groups}")
