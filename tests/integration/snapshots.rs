@@ -20,19 +20,6 @@ fn a_snapshot_contains_the_options() {
 }
 
 #[test]
-fn a_snapshot_contains_the_position_in_the_seeds() {
-    let seeding = Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) };
-    let with_range = config("MortarMayhem-v0", 0).seeding(seeding);
-    let mut player = Player::started(&with_range);
-    let snapshot = player.pool.snapshot(0).unwrap();
-    player.reset(ResetRequest::All);
-    let expected = player.bytes().to_vec();
-    player.pool.restore(0, &snapshot).unwrap();
-    player.reset(ResetRequest::All);
-    assert!(expected == player.bytes());
-}
-
-#[test]
 fn broken_snapshots_are_typed_errors() {
     let mut pool = Player::started(&config("MortarMayhem-v0", 1)).pool;
     let snapshot = pool.snapshot(0).unwrap();

@@ -2,7 +2,7 @@
 
 import gymnasium
 import pytest
-from support import WHERE, engine_of_program, exact
+from support import engine_of_program, exact
 
 import endless_gym
 
@@ -28,13 +28,6 @@ def test_used_environments_play_like_new_ones_only_with_the_argument(independent
     used, new = (gymnasium.make(f"EndlessGym/{ID}", independent_episodes=independent) for _ in range(2))
     played(used, 3, LEFT, 70)
     assert (played(used, 11, {}, 150) == played(new, 11, {}, 150)) is independent
-
-
-@pytest.mark.parametrize("where", WHERE)
-def test_used_vector_environments_play_like_new_ones(where) -> None:
-    with where(ID, 3, independent_episodes=True) as envs, where(ID, 3, independent_episodes=True) as new:
-        played(envs, 3, LEFT, 70)
-        assert played(envs, 11, {}, 100) == played(new, 11, {}, 100)
 
 
 def test_the_program_serves_independent_episodes() -> None:
