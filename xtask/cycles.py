@@ -15,6 +15,11 @@ import tomllib
 #: The folders with code, each of which uses only itself and those before it, in Rust and in Python.
 FLOORS = ["engine", "src", "bindings", "agents"]
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
+#: The rooms of each package, folders and some files at its top, in the same order.
+ROOMS = [
+    ["_native", "arguments", "specs", "display", "program", "requests", "vector", "recording", "cli"],
+    ["common", "settings", "environments", "memories", "agent", "training", "evaluation", "paper"],
+]
 CRATES = [
     "engine/kernels",
     "engine/trainer",
@@ -155,13 +160,21 @@ def upward_imports() -> Iterator[str]:
                     yield from (f"{path}: {name}" for name in imported if packages.get(name) in above)
 
 
+def upward_rooms() -> Iterator[str]:
+    """Rooms of Python packages that import one above their own."""
+    for package, rooms in zip(PACKAGES, ROOMS, strict=True):
+        for (_, *room), imported in room_imports(Path(package)).items():
+            above = rooms[rooms.index(room[0]) + 1 :] if room and room[0] in rooms else []
+            yield from (f"{package}, {room[0]}: {name[1]}" for name in imported if name[1:] and name[1] in above)
+
+
 def manifests(floor: str) -> list[Path]:
     """The manifests of a floor's crates; that of `src` is the root's."""
     return [Path("Cargo.toml")] if floor == "src" else sorted(Path(floor).glob("*/Cargo.toml"))
 
 
 failed = False
-for upward in upward_imports():
+for upward in (*upward_imports(), *upward_rooms()):
     failed = True
     print(f"{upward} is of a higher folder")
 for folder, imports in [
