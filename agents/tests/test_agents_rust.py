@@ -34,7 +34,7 @@ from endless_gym_agents.training.train import parse, train
 
 #: A segment, and so a minibatch, of one step.
 ONE_STEP = "--environment.num-envs 1 --ppo.steps 1 --recurrence.sequence-length 1"
-FLAGS = "--environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 16 --recurrence.sequence-length 6 "
+FLAGS = "--environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 16 --recurrence.sequence-length 8 "
 FLAGS += "--recurrence.hidden-size 16 --model.head-width 8 --ppo.minibatches 1 --no-stop-when-learnt --keep-checkpoints"
 ENDLESS = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())"]
 PROGRAM = [*ENDLESS, "learn"]

@@ -21,11 +21,11 @@ impl<'a> Sequences<'a> {
     ///
     /// # Errors
     ///
-    /// Says what is wrong if the sequences do not have the same number of steps.
+    /// Says what is wrong if the number of resets is not a multiple of the number of sequences.
     pub fn new(count: usize, resets: &'a [bool]) -> Result<Self, String> {
         if !resets.len().is_multiple_of(count) {
-            let steps = resets.len();
-            return Err(format!("{count} sequences must have the same number of steps, got {steps} resets for all"));
+            let given = resets.len();
+            return Err(format!("the number of resets must be a multiple of the {count} sequences, got {given}"));
         }
         Ok(Sequences { count, resets })
     }
@@ -61,11 +61,6 @@ impl Step<'_> {
         &matrix[self.rows.start * width..self.rows.end * width]
     }
 
-    /// As [`of`](Self::of), to write to.
-    pub fn of_mut<'m>(&self, matrix: &'m mut [f32], width: usize) -> &'m mut [f32] {
-        &mut matrix[self.rows.start * width..self.rows.end * width]
-    }
-
     /// The rows of this step in a matrix (M, width).
     pub fn rows<'m>(&self, matrix: &'m [f32], width: usize) -> ChunksExact<'m, f32> {
         self.of(matrix, width).chunks_exact(width)
@@ -73,7 +68,7 @@ impl Step<'_> {
 
     /// As [`rows`](Self::rows), to write to.
     pub fn rows_mut<'m>(&self, matrix: &'m mut [f32], width: usize) -> ChunksExactMut<'m, f32> {
-        self.of_mut(matrix, width).chunks_exact_mut(width)
+        matrix[self.rows.start * width..self.rows.end * width].chunks_exact_mut(width)
     }
 
     /// Copies the states before this step to columns of `saved` (M, `saved_width`): from `outputs` (M, H), from `state` (S, H) at the first
@@ -140,7 +135,7 @@ mod tests {
     fn errors_name_the_sequences_and_the_resets() {
         let message = |count: usize| Sequences::new(count, &[false; 3]).err();
         assert_eq!(message(3), None);
-        assert_eq!(message(2).unwrap(), "2 sequences must have the same number of steps, got 3 resets for all");
-        assert_eq!(message(0).unwrap(), "0 sequences must have the same number of steps, got 3 resets for all");
+        assert_eq!(message(2).unwrap(), "the number of resets must be a multiple of the 2 sequences, got 3");
+        assert_eq!(message(0).unwrap(), "the number of resets must be a multiple of the 0 sequences, got 3");
     }
 }

@@ -282,3 +282,77 @@ fn explained_variance(values: &[f32], returns: &[f32]) -> f64 {
     let variance = moments(returns).1.powi(2);
     if variance == 0.0 { f64::NAN } else { 1.0 - moments(&errors).1.powi(2) / variance }
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::{Args, Command, FromArgMatches};
+    use endless_gym_memory_gym::memory_gym;
+
+    use super::*;
+    use crate::environments::Environments;
+    use crate::rollout::{Clock, Player, Purpose, generator};
+
+    const ARGUMENTS: &str = "learn MortarMayhem-Grid-v0 --environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 24 \
+                             --recurrence.sequence-length 12 --recurrence.hidden-size 16 --recurrence.layers 2 --agent";
+
+    #[test]
+    fn whole_sequences_have_ratios_of_one_and_the_gradients_of_sequences_cut_at_episodes() {
+        for agent in ["gru", "mingru"] {
+            let command = Settings::augment_args(Command::new("learn"));
+            let arguments = ARGUMENTS.split_whitespace().chain([agent]);
+            let settings = Settings::from_arg_matches(&command.get_matches_from(arguments)).unwrap();
+            let (threads, environments) =
+                (Threads::new(1).unwrap(), Environments::in_process(memory_gym(), &settings).unwrap());
+            let (width, choices) = (environments.observation_width(), environments.choices());
+            let mut random = generator(1, Purpose::Weights, 0);
+            let network = crate::network::new(&settings, width, choices, &mut random);
+            let mut player = Player::new(&settings, &network, &threads, environments).unwrap();
+            // The second segment starts within episodes.
+            for update in 0..2 {
+                player.collect(&network, &threads, update, &mut Clock::default()).unwrap();
+            }
+            let (segment, length) = (&player.segment, settings.sequence_length());
+            let targets = Targets { advantages: segment.rewards.clone(), returns: segment.rewards.clone() };
+            let mut shard = Shard { sequences: sequences(24, 8, length), ..Shard::default() };
+            shard.compute(&network, segment, &targets, (0.0, 1.0), &settings, 0.01);
+            let Shard { pass: whole, rows, resets, actions, losses, sequences: firsts, .. } = &shard;
+
+            let mut taken = vec![0.0; actions.len()];
+            categorical::log_prob(&whole.logits, &network.spec.choices, actions, &mut taken);
+            let of = |all: &[f32]| rows.iter().map(|row| all[*row]).collect::<Vec<f32>>();
+            assert_eq!((taken, &whole.values), (of(&segment.log_probs), &of(&segment.values)), "{agent}");
+            assert_eq!(losses[4..], [0.0, 0.0]);
+
+            let (count, size) = (firsts.len(), network.spec.hidden_size);
+            assert!(resets[count..].iter().filter(|reset| **reset).count() > 8);
+            let (mut sums, mut alone) = (vec![0.0; whole.gradients.len()], Pass::default());
+            for sequence in 0..count {
+                let mut start = 0;
+                let ends = (1..=length).filter(|end| *end == length || resets[end * count + sequence]);
+                for end in ends {
+                    let steps: Vec<_> = (start..end).map(|step| step * count + sequence).collect();
+                    gather(&steps, &whole.observations, width, &mut alone.observations);
+                    gather(&steps, &whole.grad_logits, whole.logits.len() / rows.len(), &mut alone.grad_logits);
+                    gather(&steps, &whole.grad_values, 1, &mut alone.grad_values);
+                    let state = |state: &Vec<f32>| match resets[steps[0]] {
+                        true => vec![0.0; size],
+                        false => state[sequence * size..][..size].to_vec(),
+                    };
+                    alone.states = whole.states.iter().map(state).collect();
+                    let no_resets = vec![false; steps.len()];
+                    let cut = Sequences::new(1, &no_resets).unwrap();
+                    network.forward(cut, &mut alone);
+                    network.backward(cut, &mut alone);
+                    assert!(steps.iter().map(|step| whole.values[*step]).eq(alone.values.iter().copied()), "{agent}");
+                    sums.iter_mut().zip(&alone.gradients).for_each(|(sum, gradient)| *sum += gradient);
+                    start = end;
+                }
+            }
+            for tensor in &network.tensors {
+                let (sums, whole) = (&sums[tensor.range.clone()], &whole.gradients[tensor.range.clone()]);
+                let scale = whole.iter().fold(0.0, |largest: f32, gradient| largest.max(gradient.abs()));
+                assert!(sums.iter().zip(whole).all(|(a, b)| (a - b).abs() <= 1e-6 * scale), "{agent} {}", tensor.name);
+            }
+        }
+    }
+}
