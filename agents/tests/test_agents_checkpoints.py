@@ -2,11 +2,14 @@
 
 import contextlib
 import dataclasses
+import errno
+import itertools
 import json
 import os
 import re
 import resource
 import shutil
+import subprocess
 import sys
 import time
 import zipfile
@@ -18,6 +21,7 @@ import numpy as np
 import pytest
 import torch
 from agents_helpers import saved, settings
+from test_agents_training import same
 
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import make_agent
@@ -47,6 +51,68 @@ def changed(file: Path, to: Path, **state: Any) -> Path:
     content = torch.load(file, weights_only=True) | state
     torch.save({name: part for name, part in content.items() if part is not None}, to)
     return to
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {each.name: each.read_bytes() for each in folder.iterdir()}
+
+
+def test_a_checkpoint_in_parts_is_read_as_one_and_each_change_is_reported(file: Path, tmp_path: Path) -> None:
+    whole = torch.load(file, weights_only=True)
+    run = tmp_path / "run"
+    for steps in (1, 2):
+        last = checkpoint.save(run, whole | {"steps": steps}, True, 0.01)
+    size = file.stat().st_size
+    # Each save removes the parts of the former last checkpoint.
+    names = [each.name.split("-")[0] for each in sorted(last.parent.glob("last*"))]
+    assert names == ["last.pt", *(f"last.pt.{number}" for number in range(1, 1 + -(-size // 10_000)))]
+    assert all(each.stat().st_size <= 10_000 for each in last.parent.iterdir())
+    assert checkpoint.files(run) == [last.with_name("update-000001.pt")]
+    assert set(last.parent.iterdir()) < set(checkpoint.protected(run))
+    elsewhere = Path(shutil.copytree(last.parent, tmp_path / "elsewhere"))
+    for given in (run, elsewhere / "last.pt", elsewhere / "update-000001.pt"):
+        assert same(checkpoint.load(given).state, whole | {"steps": 2})
+    assert set(checkpoint.protected(elsewhere / "last.pt")) == set(elsewhere.glob("last.pt*"))
+    for part in elsewhere.glob("last.pt.*"):
+        content = part.read_bytes()
+        for other in (content[:-1], content[:-1] + bytes([content[-1] ^ 1])):
+            part.write_bytes(other)
+            with pytest.raises(ValueError, match=f"is damaged: its part {part.name} has changed since"):
+                checkpoint.load(elsewhere / "last.pt")
+        part.unlink()
+        with pytest.raises(FileNotFoundError, match=f"has no part {part.name}; copy all files .*last.pt"):
+            checkpoint.load(elsewhere / "last.pt")
+        part.write_bytes(content)
+    for text in ('{"parts": [', '{"parts": []}', '{"parts": [1', '{"parts": ["/etc"]}', '{"parts": [[]]}'):
+        (elsewhere / "last.pt").write_text(text)
+        with pytest.raises(ValueError, match="is not a checkpoint, or is truncated"):
+            checkpoint.load(elsewhere / "last.pt")
+    assert same(checkpoint.load(checkpoint.save(run, whole, False)).state, whole)
+    assert sorted(each.name.split(".")[0] for each in last.parent.iterdir()).count("last") == 1
+
+
+def test_a_run_continues_exactly_in_another_folder_with_another_number_of_cores(tmp_path: Path) -> None:
+    """As on another machine, from parts that were copied there."""
+    flags = [
+        "--env",
+        "MortarMayhem-Grid-v0",
+        "--preset",
+        "quick",
+        "--threads",
+        "1",
+        "--environment.num-envs",
+        "8",
+        "--run",
+    ]
+    train.train(train.parse([*flags, str(tmp_path / "whole"), "--ppo.updates", "4"]))
+    parts = ["--checkpoint-megabytes", "0.1", "--ppo.updates", "2"]
+    shutil.move(train.train(train.parse([*flags, str(tmp_path / "first"), *parts])), tmp_path / "second")
+    assert len(list((tmp_path / "second" / "checkpoints").iterdir())) > 3
+    command = [sys.executable, "-m", "endless_gym_agents.train", "--resume", "second", "--ppo.updates", "4"]
+    core = min(os.sched_getaffinity(0))
+    subprocess.run(["taskset", "-c", str(core), *command], cwd=tmp_path, check=True, timeout=120)
+    one, two = (checkpoint.load(tmp_path / name).state for name in ("whole", "second"))
+    assert two["update"] == 4 and same(one | {"settings": None}, two | {"settings": None})
 
 
 def test_a_truncated_checkpoint_is_refused_at_any_length(file: Path, tmp_path: Path) -> None:
@@ -191,19 +257,41 @@ def forked(work: Callable[[], object]) -> Iterator[int]:
     yield process
 
 
-def test_a_full_disk_leaves_the_former_checkpoint(file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("megabytes", [0.0, 0.02])
+def test_a_full_disk_leaves_the_former_checkpoint(megabytes: float, file: Path, tmp_path: Path) -> None:
     run, state = tmp_path / "run", torch.load(file, weights_only=True)
-    former = checkpoint.save(run, state, False).read_bytes()
+    folder = checkpoint.save(run, state, False, megabytes).parent
+    former = contents(folder)
 
     def save(limit: int) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
         with pytest.raises(OSError, match="File too large"):
-            checkpoint.save(run, state | {"steps": 1}, True)
+            checkpoint.save(run, state | {"steps": 1}, True, megabytes)
 
-    for limit in (0, 1000, len(former) // 2):
+    for limit in (0, 1000, max(map(len, former.values())) // 2):
         with forked(lambda limit=limit: save(limit)) as process:  # type: ignore[misc]
             assert os.waitpid(process, 0)[1] == 0
-        assert {each.name: each.read_bytes() for each in (run / "checkpoints").iterdir()} == {"last.pt": former}
+        assert contents(folder) == former
+
+
+def test_a_disk_that_is_full_after_some_parts_leaves_no_others(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, state = tmp_path / "run", torch.load(file, weights_only=True)
+    folder = checkpoint.save(run, state, False, 0.004).parent
+    former, write = contents(folder), checkpoint.atomic.write
+    for number in range(1, len(former)):
+        calls = itertools.count(1)
+
+        def fails(*given: Any, calls: Iterator[int] = calls, number: int = number) -> None:
+            if next(calls) == number:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            write(*given)
+
+        monkeypatch.setattr(checkpoint.atomic, "write", fails)
+        with pytest.raises(OSError, match="No space left"):
+            checkpoint.save(run, state | {"steps": 1}, False, 0.004)
+        assert contents(folder) == former
 
 
 def test_deep_settings_are_refused(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -209,6 +210,29 @@ def test_a_checkpoint_is_written_after_some_minutes(tmp_path: Path) -> None:
     # At the third update, the checkpoint of the second is there; those that only the time asked for are not kept.
     assert saved == [0, 1, 2]
     assert [file.name for file in checkpoint.files(run)] == ["update-000000.pt", "update-000003.pt"]
+
+
+@pytest.mark.parametrize("interval", [1, 2, 100])
+def test_a_run_ends_within_its_time_limit(interval: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With simulated time: an update takes 10 seconds, the second 15, to save 3, and to load 4."""
+    seconds, save, load, learn = 0.0, checkpoint.save, checkpoint.load, training.learn
+
+    def passes(duration: float, result: Any = None) -> Any:
+        nonlocal seconds
+        seconds += duration
+        return result
+
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: seconds))
+    monkeypatch.setattr(checkpoint, "save", lambda *given: passes(3, save(*given)))
+    monkeypatch.setattr(checkpoint, "load", lambda *given: passes(4, load(*given)))
+    monkeypatch.setattr(training, "learn", lambda *given: passes(15 if given[4] == 1 else 10, learn(*given)))
+    given = small("none", tmp_path / "run", updates=99)
+    run = train(replace(given, time_limit=1.0, checkpoint_interval=interval))
+    assert seconds == {1: 47, 2: 44, 100: 51}[interval]
+    assert checkpoint.load(run).update == len(read_progress(run)) == (4 if interval == 100 else 3)
+    seconds = 0.0
+    train(parse(["--resume", str(run), "--time-limit", "1"]))
+    assert seconds == {1: 56, 2: 53, 100: 47}[interval]
 
 
 @pytest.mark.slow

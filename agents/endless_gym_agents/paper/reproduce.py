@@ -106,7 +106,7 @@ def show_status(planned: list[Job], console: Console) -> None:
 def remove_checkpoints(job: Job) -> None:
     """Remove the checkpoints of an evaluated run, except the last."""
     if job.experiment.kind == "curves":
-        for file in (job.folder / checkpoint.FOLDER).glob("update-*.pt"):
+        for file in (job.folder / checkpoint.FOLDER).glob("update-*.pt*"):
             file.unlink()
 
 

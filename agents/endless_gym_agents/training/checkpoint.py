@@ -11,8 +11,10 @@ agent, steps = loaded.agent, loaded.steps
 from __future__ import annotations
 
 import contextlib
+import glob
 import io
 import json
+import math
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -45,6 +47,9 @@ RUST_SUFFIX = ".safetensors"
 
 #: Longest header of such a file in bytes: far more than a network needs, and few enough to read at once.
 _MAX_HEADER = 4 << 20
+
+#: How the file of a checkpoint in parts begins, which lists their checksums.
+_PARTS = b'{"parts": ['
 
 
 @dataclass
@@ -89,20 +94,24 @@ def checked(run: Path) -> Iterator[None]:
         ) from error
 
 
-def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
+def save(run: Path, state: dict[str, Any], keep: bool, megabytes: float = 0.0) -> Path:
     """Write a checkpoint as the last one of a run, atomically.
+
+    The parts of a large `last.pt` are files `last.pt.1-CHECKSUM` and so on, and `last.pt` then lists their checksums. Former
+    parts stay until it is replaced.
 
     Args:
         run: Folder of the run.
         state: `settings` (from `to_dict`), `update`, `steps`, `model`; and to resume, `optimizer`, `generators`, `player` (the
             state of the rollout collector) and `episodes`.
         keep: Also keep the checkpoint under the number of its update.
+        megabytes: Size of the parts that a larger checkpoint is divided into; 0 for no parts.
 
     Returns:
         Path of the last checkpoint.
 
     Raises:
-        OSError: The file cannot be written, as on a full disk. The former checkpoint stays the last one.
+        OSError: A file cannot be written, as on a full disk. The former checkpoint stays the last one.
     """
     folder = run / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -111,9 +120,54 @@ def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
     torch.save({"version": CHECKPOINT_VERSION} | state, content)
     if keep:
         # First, since a run that resumes from the last one does not write its number again.
-        atomic.write(folder / f"update-{state['update']:06d}.pt", content.getbuffer())
-    atomic.write(folder / LAST, content.getbuffer())
+        _write(folder / f"update-{state['update']:06d}.pt", content.getbuffer(), megabytes)
+    _write(folder / LAST, content.getbuffer(), megabytes)
     return folder / LAST
+
+
+def _write(file: Path, content: memoryview, megabytes: float) -> None:
+    size = math.ceil(1e6 * megabytes)
+    pieces = [content[start:][:size] for start in range(0, len(content), size)] if 0 < size < len(content) else []
+    checksums = list(map(zlib.crc32, pieces))
+    try:
+        for number, piece in enumerate(pieces, 1):
+            atomic.write(_part(file, number, checksums[number - 1]), piece)
+        atomic.write(file, json.dumps({"parts": checksums}) if pieces else content)
+    finally:
+        remove_unlisted(file)
+
+
+def remove_unlisted(file: Path) -> None:
+    """Remove parts of a checkpoint that is no longer there, and of one that was not completed."""
+    for part in set(_parts(file)).difference(_listed(file) or []):
+        part.unlink()
+
+
+def _part(file: Path, number: int, checksum: int) -> Path:
+    return file.with_name(f"{file.name}.{number}-{checksum:08x}")
+
+
+def _parts(file: Path) -> list[Path]:
+    """The files that are parts of a checkpoint according to their names."""
+    return list(file.parent.glob(f"{glob.escape(file.name)}.[0-9]*-*"))
+
+
+def _listed(file: Path) -> list[Path] | None:
+    """The parts that a checkpoint lists; None if it is one file, or not there.
+
+    Raises:
+        ValueError: The list is invalid.
+    """
+    if not file.exists():
+        return None
+    with regular.opened(file) as content:
+        start = content.read(len(_PARTS))
+        if start != _PARTS:
+            return None
+        try:
+            return [_part(file, *each) for each in enumerate(json.loads(start + content.read())["parts"], 1)]
+        except (RecursionError, TypeError, ValueError) as error:
+            raise ValueError(f"{file} is not a checkpoint, or is truncated: {error}") from error
 
 
 def files(run: str | Path) -> list[Path]:
@@ -137,7 +191,7 @@ def protected(path: str | Path) -> list[Path]:
     """
     file = last(path) if Path(path).is_dir() else Path(path)
     if file.parent.name != FOLDER:
-        return [file]
+        return [file, *_parts(file)]
     run = file.parent.parent
     return [file, run / SETTINGS, run / PROGRESS, *file.parent.glob("*")]
 
@@ -165,7 +219,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     if file.suffix == RUST_SUFFIX:
         state, versions = _read_of_rust(file), FILE_VERSIONS
     else:
-        with regular.opened(file) as content:
+        with _opened(file) as content:
             state = _read(content, file)
     if (version := state.get("version")) not in versions:
         raise ValueError(
@@ -176,7 +230,8 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         raise ValueError(f"checkpoint {file} is incomplete: it has no {', '.join(missing)}")
     try:
         # A small file may have tensors of any size, whose strides repeat a few numbers.
-        claimed, size = sum(weights.nbytes for weights in state["model"].values()), file.stat().st_size
+        claimed = sum(weights.nbytes for weights in state["model"].values())
+        size = sum(each.stat().st_size for each in (file, *_parts(file)))
         if claimed > size:
             raise ValueError(f"its weights claim {claimed} bytes, and the file has {size}")
         agent, settings = _agent(state, device)
@@ -193,6 +248,28 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         )
     agent.eval()
     return Checkpoint(settings, agent, state["update"], state["steps"], state)
+
+
+def _opened(file: Path) -> BinaryIO:
+    """Open a checkpoint. Its parts are joined.
+
+    Raises:
+        FileNotFoundError: A part is missing.
+        ValueError: A part has changed, or the file that lists them.
+    """
+    if (listed := _listed(file)) is None:
+        return regular.opened(file)
+    joined = io.BytesIO()
+    for part in listed:
+        if not part.exists():
+            raise FileNotFoundError(f"checkpoint {file} has no part {part.name}; copy all files {file.name}.* with it")
+        with regular.opened(part) as content:
+            piece = content.read()
+        if not part.name.endswith(f"-{zlib.crc32(piece):08x}"):
+            raise ValueError(f"checkpoint {file} is damaged: its part {part.name} has changed since it was written")
+        joined.write(piece)
+    joined.seek(0)
+    return joined
 
 
 def _read(content: BinaryIO, file: Path) -> dict[str, Any]:

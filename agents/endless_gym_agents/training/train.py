@@ -98,8 +98,13 @@ def train_rank(
     if settings.resume or has_begun:
         check_resumable(settings, checkpoint.read_settings(run))
         settings = dataclasses.replace(settings, resume="", run=str(run))
+    # Until a checkpoint was saved, it is taken to last as long as loading one.
+    started = time.monotonic()
     if has_begun:
         resumed = checkpoint.load(run).resumable()
+        if ranks.is_first:
+            checkpoint.remove_unlisted(checkpoint.last(run))
+    saving = time.monotonic() - started
 
     torch.manual_seed(settings.seed)
     generators = {
@@ -107,7 +112,7 @@ def train_rank(
         "minibatches": torch.Generator().manual_seed(settings.seed),
     }
 
-    ppo, started, stop = settings.ppo, time.monotonic(), Interrupt(ranks)
+    ppo, stop = settings.ppo, Interrupt(ranks)
     with stop, Environments(settings, episode_options, ranks, pin_memory=device.type != "cpu") as environments:
         agent = make_agent(settings, environments.spec, device)
         started_from = checkpoint.start_from(agent, settings.init_from) if settings.init_from and not resumed else ""
@@ -131,7 +136,7 @@ def train_rank(
         ranks.copy_from_first(agent.state_dict().values())
 
         def save(keep: bool) -> None:
-            nonlocal saved, saved_at
+            nonlocal saved, saved_at, saving
             saved, saved_at = update, time.monotonic()
             players = ranks.gathered(collector.state_dict())
             if players is None:
@@ -147,7 +152,8 @@ def train_rank(
                 "episodes": list(episodes),
             }
             logger.sync()
-            checkpoint.save(run, state, keep)
+            checkpoint.save(run, state, keep, settings.checkpoint_megabytes)
+            saving = time.monotonic() - saved_at
 
         logger = Logger(run, settings, update, steps) if ranks.is_first else SilentLogger()
         # Written only after everything above has succeeded. A resumed run keeps its changed settings.
@@ -163,9 +169,9 @@ def train_rank(
             logger.print(started_from)
 
         success: str | None = None
-        clock, stops = Clock(), False
+        clock, stops, longest = Clock(), False, 0.0
         while update < ppo.updates and not stops:
-            start = time.perf_counter()
+            start = time.monotonic()
             environments.mark(logger.print)
             segment, ended = collector.collect(clock)
             with clock.measure("learning"):
@@ -179,14 +185,11 @@ def train_rank(
             for infos in ranks.everywhere(ended):
                 episodes.extend(infos)
             recent = means(episodes)
-            rate = new_steps / (time.perf_counter() - start)
+            rate = new_steps / (time.monotonic() - start)
             logger.update(
                 {"update": update, "steps": steps, "steps_per_second": rate} | recent | learning, clock.take()
             )
 
-            minutes = (time.monotonic() - started) / 60
-            if settings.time_limit and minutes >= settings.time_limit:
-                stop.requested = True
             reward, target = recent.get("episode/reward"), settings.target_reward
             if reward is not None and target is not None and len(episodes) == RECENT and reward >= target:
                 stop.requested = True
@@ -196,6 +199,11 @@ def train_rank(
             if environments.failure is not None:
                 stop.requested = True
             if watch is not None and watch(update, recent):
+                stop.requested = True
+            now = time.monotonic()
+            longest = max(longest, now - start)
+            # Time for a checkpoint now, another update, and the last checkpoint.
+            if settings.time_limit and started + 60 * settings.time_limit < now + longest + 2 * saving:
                 stop.requested = True
             is_late = (
                 bool(settings.checkpoint_minutes) and time.monotonic() >= saved_at + 60 * settings.checkpoint_minutes
