@@ -242,14 +242,13 @@ class Settings:
     keep_checkpoints: bool = False
     """keep all checkpoints, for evaluation, instead of only the last"""
     checkpoint_megabytes: FromZero = 0.0
-    """divide larger checkpoints into files of this many megabytes, for places that limit the size of a file; 0 for no division"""
+    """divide checkpoints into files of at most this many megabytes; 0 for one file each"""
     on_engine_failure: Literal["restart", "save", "fail"] = "restart"
     """what to do when the engine process ends or does not answer. restart: start another one, which continues exactly; after
     three restarts without a completed update, as `save`. save: complete the update in this process, write a checkpoint and stop.
     fail: stop at once"""
     time_limit: FromZero = 0.0
-    """minutes within which training stops with a checkpoint: no update begins that could end later, as long as the longest one so
-    far; 0 for no limit"""
+    """minutes within which training stops with a checkpoint, by the time that updates and checkpoints took; 0 for no limit"""
     target_reward: Annotated[float | None, Range()] = None
     """stop when the mean reward of the last 100 episodes reaches this value"""
     stop_when_learnt: bool = False

@@ -91,6 +91,22 @@ def test_a_checkpoint_in_parts_is_read_as_one_and_each_change_is_reported(file: 
     assert sorted(each.name.split(".")[0] for each in last.parent.iterdir()).count("last") == 1
 
 
+def test_a_run_that_saves_while_its_checkpoint_is_read(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, opened = torch.load(file, weights_only=True), checkpoint.regular.opened
+    run = checkpoint.save(tmp_path, state, False, 0.01).parents[1]
+
+    def saves(part: Path) -> Any:
+        if ".pt." in part.name:
+            monkeypatch.setattr(checkpoint.regular, "opened", opened)
+            checkpoint.save(run, state | {"steps": 1}, False, 0.01)
+        return opened(part)
+
+    monkeypatch.setattr(checkpoint.regular, "opened", saves)
+    assert checkpoint.load(run).steps == 1
+
+
 def test_a_run_continues_exactly_in_another_folder_with_another_number_of_cores(tmp_path: Path) -> None:
     """As on another machine, from parts that were copied there."""
     flags = [

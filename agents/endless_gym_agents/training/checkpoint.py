@@ -217,10 +217,10 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         )
     versions: tuple[int, ...] = (CHECKPOINT_VERSION,)
     if file.suffix == RUST_SUFFIX:
-        state, versions = _read_of_rust(file), FILE_VERSIONS
+        state, versions, size = _read_of_rust(file), FILE_VERSIONS, file.stat().st_size
     else:
         with _opened(file) as content:
-            state = _read(content, file)
+            state, size = _read(content, file), content.seek(0, io.SEEK_END)
     if (version := state.get("version")) not in versions:
         raise ValueError(
             f"checkpoint {file} must be of version {' or '.join(map(str, versions))}, got {version}; "
@@ -231,7 +231,6 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     try:
         # A small file may have tensors of any size, whose strides repeat a few numbers.
         claimed = sum(weights.nbytes for weights in state["model"].values())
-        size = sum(each.stat().st_size for each in (file, *_parts(file)))
         if claimed > size:
             raise ValueError(f"its weights claim {claimed} bytes, and the file has {size}")
         agent, settings = _agent(state, device)
@@ -261,10 +260,14 @@ def _opened(file: Path) -> BinaryIO:
         return regular.opened(file)
     joined = io.BytesIO()
     for part in listed:
-        if not part.exists():
-            raise FileNotFoundError(f"checkpoint {file} has no part {part.name}; copy all files {file.name}.* with it")
-        with regular.opened(part) as content:
-            piece = content.read()
+        try:
+            with regular.opened(part) as content:
+                piece = content.read()
+        except FileNotFoundError:
+            if _listed(file) != listed:  # The run has saved another one.
+                return _opened(file)
+            message = f"checkpoint {file} has no part {part.name}; copy all files {file.name}.* with it"
+            raise FileNotFoundError(message) from None
         if not part.name.endswith(f"-{zlib.crc32(piece):08x}"):
             raise ValueError(f"checkpoint {file} is damaged: its part {part.name} has changed since it was written")
         joined.write(piece)
