@@ -1,4 +1,4 @@
-"""POPGym's observations as vectors for the agents: `--environment.wrapper endless_gym_agents.popgym:Vectors`."""
+"""POPGym's observations as vectors for the agents, which `endless-train` uses where observations are integers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Vectors(PreviousAction):
     vectors in which integers are one-hot.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
-        super().__init__(envs, flatten=True)
+    def __init__(self, envs: VectorEnv[Any, Any, Any], **added: bool) -> None:
+        super().__init__(envs, flatten=True, **added)
         entries = self.single_observation_space.shape or ()
         self.single_observation_space = spaces.Box(-np.inf, np.inf, entries, np.float32)
         self.observation_space = batch_space(self.single_observation_space, envs.num_envs)
@@ -34,3 +34,10 @@ class Vectors(PreviousAction):
 
     def _joined(self, observation: Any, actions: NDArray[Any], first: NDArray[np.int64]) -> Any:
         return super()._joined(observation, actions, first).astype(np.float32)
+
+
+class OneHot(Vectors):
+    """Observations in which integers are one-hot, as those of `endless learn`."""
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(envs, previous_action=False, antialias=False)

@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Annotated, Any, Literal
 
+from gymnasium import spaces
 from gymnasium.vector import VectorWrapper
 from torch import nn
 
-from endless_gym.specs import DEFAULT_ENV_ID, spec
+from endless_gym.specs import DEFAULT_ENV_ID, Frames, Spec, all_specs, spec
 from endless_gym_agents.common import own, ranges
 from endless_gym_agents.common.own import MEMORIES
 from endless_gym_agents.common.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
@@ -30,6 +31,9 @@ PresetName = Literal["paper", "old", "overnight", "throughput", "throughput-512"
 TRAINING_SEEDS = range(100_000)
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
+
+#: The wrapper in environments whose observations are not vectors, and what a run of `endless learn` observes there.
+VECTORS, ONE_HOT = (f"endless_gym_agents.popgym:{name}" for name in ("Vectors", "OneHot"))
 
 
 def paper_run_length(env: str, agent: str) -> int:
@@ -57,10 +61,12 @@ class Environment:
     option: tuple[str, ...] = ()
     """reset parameters, each as NAME=VALUE with a JSON value, such as `command_count=[2]`"""
     observation: Literal["rgb", "features"] = "rgb"
-    """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU"""
+    """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU, and
+    in environments without frames"""
     wrapper: tuple[str, ...] = ()
     """wrappers of your own, from the inside out: module:Class or file.py:Class of a `gymnasium.vector.VectorWrapper`, such as one
-    that shapes the reward"""
+    that shapes the reward. Without one, integers that an environment returns, as many of POPGym do, become vectors, with the
+    previous action"""
     num_envs: Positive = 32
     """total number of environments in all groups and on all ranks of a data-parallel run; the number of workers in the paper"""
     groups: Positive = 1
@@ -70,6 +76,14 @@ class Environment:
     """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
     num_threads: Natural = 0
     """threads that step the environments; 0 for one per core"""
+
+    def fitted(self, described: Spec, vectors: str = VECTORS) -> Environment:
+        """These settings with features if there are no frames, and with the wrapper `vectors` if there is none for integers."""
+        observation: Literal["rgb", "features"] = self.observation if described.frame else "features"
+        space = described.observation_space(Frames() if observation == "rgb" else None, observation == "features")
+        is_fitting = self.wrapper or isinstance(space, spaces.Box | spaces.Dict)
+        wrapper = self.wrapper if is_fitting else (vectors,)
+        return dataclasses.replace(self, observation=observation, wrapper=wrapper)
 
 
 @dataclass(frozen=True)
@@ -304,8 +318,9 @@ class Settings:
         Raises:
             ValueError: A value is out of range, or a combination is not supported.
         """
-        ranges.check(self)
         env_spec = spec(self.env)
+        self = dataclasses.replace(self, environment=self.environment.fitted(env_spec))
+        ranges.check(self)
         env_spec.max_episode_steps(self.options())  # raises if the options are not valid
         if self.agent_class:
             own.load("--agent", self.agent_class, nn.Module)
@@ -506,7 +521,7 @@ def from_dict(values: dict[str, Any]) -> Settings:
             values[part.name] = kind(**values.get(part.name, {}))
     # JSON has lists for tuples.
     environment = values["environment"]
-    values["environment"] = dataclasses.replace(
-        environment, option=tuple(environment.option), wrapper=tuple(environment.wrapper)
-    )
+    environment = dataclasses.replace(environment, option=tuple(environment.option), wrapper=tuple(environment.wrapper))
+    described = all_specs().get(values.get("env", DEFAULT_ENV_ID).removeprefix("EndlessGym/"))
+    values["environment"] = environment.fitted(described, ONE_HOT) if described else environment
     return Settings(**values | {name: tuple(values.get(name, ())) for name in ("agent_option", "encoder_option")})

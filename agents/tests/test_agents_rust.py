@@ -34,7 +34,8 @@ from endless_gym_agents.training.train import parse, train
 
 #: A segment, and so a minibatch, of one step.
 ONE_STEP = "--environment.num-envs 1 --ppo.steps 1 --recurrence.sequence-length 1"
-FLAGS = "--environment.option command_count=[1] --environment.num-envs 8 --ppo.steps 16 --recurrence.sequence-length 8 "
+GRID = "MortarMayhem-Grid-v0 --environment.option command_count=[1]"
+FLAGS = "--environment.num-envs 8 --ppo.steps 16 --recurrence.sequence-length 8 "
 FLAGS += "--recurrence.hidden-size 16 --model.head-width 8 --ppo.minibatches 1 --no-stop-when-learnt --keep-checkpoints"
 ENDLESS = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())"]
 PROGRAM = [*ENDLESS, "learn"]
@@ -47,8 +48,8 @@ def learn(arguments: str, fails: bool = False) -> str:
     return result.stderr if fails else result.stdout
 
 
-def new_run(run: Path, flags: str) -> Path:
-    learn(f"MortarMayhem-Grid-v0 {FLAGS} --run {run} {flags}")
+def new_run(run: Path, flags: str, env: str = GRID) -> Path:
+    learn(f"{env} {FLAGS} --run {run} {flags}")
     return run
 
 
@@ -66,6 +67,8 @@ def noise_of(seed: int, update: int, shape: tuple[int, ...]) -> Tensor:
 @pytest.mark.parametrize(
     "flags",
     [
+        "popgym-AutoencodeEasy-v0",
+        "popgym-CountRecallEasy-v0",
         "--agent gru --recurrence.layers 2 --recurrence.residual",
         "--agent gru --ppo.advantage-normalisation none --recurrence.no-embedding",
         "--agent mingru --recurrence.layers 2 --ppo.advantage-normalisation batch",
@@ -77,7 +80,8 @@ def noise_of(seed: int, update: int, shape: tuple[int, ...]) -> Tensor:
 def test_one_update_equals_that_of_the_python_agents(
     flags: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = new_run(tmp_path / "run", f"{flags} --ppo.updates 1 --threads 2")
+    env, flags = (flags, "") if flags.startswith("popgym") else (GRID, flags)
+    run = new_run(tmp_path / "run", f"{flags} --ppo.updates 1 --threads 2", env)
     before, after = numbered(run, 0), numbered(run, 1)
     settings, agent = before.settings, before.agent
     monkeypatch.setattr(Agent, "noise", lambda self, shape, generator: noise_of(1, 0, (*shape, 1, agent.branches[0])))
@@ -89,7 +93,7 @@ def test_one_update_equals_that_of_the_python_agents(
         # The only minibatch has all sequences, so their order does not matter.
         metrics = ppo.learn(agent, optimizer, segment, states, 0, settings.ppo, torch.Generator())
     (row,) = read_progress(run)
-    if settings.ppo.steps > 1:
+    if ended:
         assert row["episode/length"] == pytest.approx(np.mean([episode["length"] for episode in ended]))
     assert {name for name in row if "/" not in name} == {*metrics, "update", "steps", "steps_per_second"}
     for name, number in metrics.items():
@@ -109,8 +113,11 @@ def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(evaluate(loaded.agent, range(200_000, 200_003), 1, num_threads=1)) == 3
     monkeypatch.setattr(sys, "argv", ["endless-plot", str(run), "--out", str(tmp_path / "plots")])
     assert plot.main() == 0 and any((tmp_path / "plots").glob("*.png"))
-    with pytest.raises(ValueError, match=r"cannot be resumed.*--init-from"):
-        loaded.resumable()
+    with pytest.raises(ValueError, match=rf"continue it with: endless learn --resume {run}, or .*--init-from"):
+        train(parse(["--resume", str(run)]))
+    (run / "checkpoints/last.safetensors").rename(run / "checkpoints/last.pt")
+    assert f"continue it with: endless-train --resume {run}; " in learn(f"--resume {run}", fails=True)
+    (run / "checkpoints/last.pt").rename(run / "checkpoints/last.safetensors")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run)).Reload()
@@ -127,7 +134,7 @@ def test_an_episode_of_a_run_is_a_picture(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = new_run(tmp_path / "rust", "--ppo.updates 1")
-    given = parse(f"--env MortarMayhem-Grid-v0 --preset quick {FLAGS} --threads 1 --ppo.updates 1".split())
+    given = parse(f"--env {GRID} --preset quick {FLAGS} --threads 1 --ppo.updates 1".split())
     ours = train(replace(given, run=str(tmp_path / "python"), init_from=str(run)))
     started = checkpoint.load(ours / "checkpoints" / "update-000000.pt").agent.state_dict()
     assert all(torch.equal(weights, started[name]) for name, weights in checkpoint.load(run).agent.state_dict().items())
@@ -182,7 +189,7 @@ def test_a_damaged_or_forged_checkpoint_is_refused(tmp_path: Path) -> None:
 @contextmanager
 def training(run: Path) -> Iterator[subprocess.Popen[str]]:
     """A process that trains in `run`, after its first update, until it is killed."""
-    arguments = f"--resume {run}" if run.exists() else f"MortarMayhem-Grid-v0 {FLAGS} --run {run}"
+    arguments = f"--resume {run}" if run.exists() else f"{GRID} {FLAGS} --run {run}"
     flags = "--ppo.updates 1000000 --checkpoint-interval 1 --no-keep-checkpoints"
     command = [*PROGRAM, *arguments.split(), *flags.split()]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -229,7 +236,7 @@ def serving(name: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
 def test_a_run_in_a_served_engine_outlives_the_engine(tmp_path: Path) -> None:
     name, run = f"learn-{tmp_path.name}", tmp_path / "run"
     flags = ["--features", "--no-frames", "--autoreset", "same-step"]
-    learning = FLAGS.replace("--environment.option command_count=[1] --environment.num-envs 8 ", "").split()
+    learning = FLAGS.replace("--environment.num-envs 8 ", "").split()
     command = [
         *PROGRAM,
         "MortarMayhem-Grid-v0",

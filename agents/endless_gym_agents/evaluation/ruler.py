@@ -12,7 +12,7 @@ python -m endless_gym_agents.ruler          # plays experts and random actions, 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,7 +23,7 @@ from endless_gym.create import make_vec
 from endless_gym.experts import Experts
 from endless_gym.specs import spec
 from endless_gym_agents.common import command
-from endless_gym_agents.settings import Environment, Settings
+from endless_gym_agents.settings import VECTORS, Environment, Settings
 
 #: What a task measures: which of several things was seen; where something is; in which order things were seen; how many.
 Label = Literal["object", "spatial", "sequential", "capacity"]
@@ -31,8 +31,6 @@ Label = Literal["object", "spatial", "sequential", "capacity"]
 GATE = 0.5
 #: Seeds of the episodes of experts and random actions; the evaluation's first ones.
 SEEDS = range(200_000, 200_400)
-#: The wrapper with which the agents play POPGym.
-VECTORS = "endless_gym_agents.popgym:Vectors"
 
 
 @dataclass(frozen=True)
@@ -113,14 +111,9 @@ def mean_return(task: Task, expert: bool, seeds: Sequence[int] = SEEDS) -> float
     """Mean return of the scripted expert, or of random actions, in one episode of each seed."""
     num_envs = len(seeds)
     generator, described = np.random.default_rng(0), spec(task.env)
+    choose: Callable[[Any, Any], NDArray[Any]]
     if expert:
-        experts = Experts(task.env, num_envs)
-
-        def choose(observation: Any, start: Any) -> NDArray[Any]:
-            # The experts take numbers as vectors, too.
-            parts = observation if isinstance(observation, tuple) else (observation,)
-            return experts.act(np.concatenate([np.reshape(part, (num_envs, -1)) for part in parts], axis=1), start)
-
+        choose = Experts(task.env, num_envs).act
     else:
 
         def choose(observation: Any, start: Any) -> NDArray[Any]:

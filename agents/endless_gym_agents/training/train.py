@@ -69,6 +69,11 @@ def train(
         Diverged: A loss, a gradient or the weights are no longer finite. The last checkpoint is from before.
     """
     command.check_installed("training", "tensorboard")
+    if settings.resume and checkpoint.last(settings.resume).suffix == checkpoint.RUST_SUFFIX:
+        raise ValueError(
+            f"{settings.resume} is a run of `endless learn`; continue it with: endless learn --resume {settings.resume}, or "
+            "start a new run from its weights with --init-from"
+        )
     settings, ranks = settings.validated(), Ranks()
     ranks.check(settings.environment.num_envs, settings.environment.groups)
     device = choose_device(settings.device, ranks)

@@ -49,9 +49,9 @@ class Experts:
         """Choose the actions. Call it exactly once for each observation, including the first of an episode.
 
         Args:
-            observation: `features`, float32 (n, f); or a dict with `features` and, for the ids that have one,
-                `vector_observation`, float32 (n, v), as a vector environment with `observation="features"` or `"rgb+features"`
-                returns it.
+            observation: What a vector environment with `observation="features"` or `"rgb+features"` returns: the features,
+                float32 (n, f), integers or a tuple; or a dict with `features` and, for the ids that have one,
+                `vector_observation`, float32 (n, v).
             episode_start: Whether the observation is the first of an episode, bool (n,).
             active: The environments that need an action, bool (n,); the others' actions are 0. `None` for all.
 
@@ -66,7 +66,7 @@ class Experts:
         needed = ["features", *(["vector_observation"] if self._spec.vector_observation else [])]
         if any(name not in parts for name in needed):
             raise ValueError(f"observation must have {' and '.join(needed)}, got {', '.join(parts)}")
-        arrays = [np.ascontiguousarray(parts[name], dtype=np.float32) for name in needed]
+        arrays = [np.ascontiguousarray(self._numbers(parts[name]), dtype=np.float32) for name in needed]
         turn = np.where(self._flags("episode_start", episode_start), np.uint8(2), np.uint8(1))
         if active is not None:
             turn[~self._flags("active", active)] = 0
@@ -76,6 +76,13 @@ class Experts:
                 raise ValueError(f"{name} must have the shape ({self.num_envs}, {columns}), got {array.shape}")
         vector = arrays[1] if len(arrays) > 1 else None
         return self._spec.batched_actions(self._native.act(arrays[0], vector, turn))
+
+    def _numbers(self, observation: Any) -> Any:
+        """The numbers of observations as rows, the inverse of `Spec.feature_observation`."""
+        if isinstance(observation, tuple):
+            return np.concatenate([self._numbers(part) for part in observation], axis=-1)
+        is_discrete = self._spec.described_features is not None and np.ndim(observation) == 1
+        return np.asarray(observation)[:, None] if is_discrete else observation
 
     def _flags(self, name: str, given: Any) -> NDArray[np.bool_]:
         flags = np.asarray(given)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -18,16 +19,24 @@ class PreviousAction(VectorWrapper):
 
     Args:
         envs: A vector environment, whose groups, if it has several, are not stepped apart.
+        previous_action: Add the previous action.
         antialias: Add a last part, 1 in the first step of an episode and otherwise 0, as POPGym's `Antialias`.
         flatten: Return arrays (n, k), in which integers are one-hot, as POPGym's `Flatten`.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any], *, antialias: bool = True, flatten: bool = False) -> None:
+    def __init__(
+        self,
+        envs: VectorEnv[Any, Any, Any],
+        *,
+        previous_action: bool = True,
+        antialias: bool = True,
+        flatten: bool = False,
+    ) -> None:
         super().__init__(envs)
         observed = envs.single_observation_space
-        parts = (*(observed.spaces if isinstance(observed, spaces.Tuple) else (observed,)), envs.single_action_space)
-        space = spaces.Tuple((*parts, spaces.Discrete(2)) if antialias else parts)
-        self._antialias, self._parts = antialias, space.spaces
+        parts = observed.spaces if isinstance(observed, spaces.Tuple) else (observed,)
+        space = spaces.Tuple((*parts, *[envs.single_action_space] * previous_action, *[spaces.Discrete(2)] * antialias))
+        self._is_added, self._parts = (previous_action, antialias), space.spaces
         self._flat = flatten_space(space) if flatten else None
         self.single_observation_space = space if self._flat is None else self._flat
         self.observation_space = batch_space(self.single_observation_space, envs.num_envs)
@@ -80,9 +89,8 @@ class PreviousAction(VectorWrapper):
         return batch[0] if self._flat is not None else tuple(part[0] for part in batch)
 
     def _joined(self, observation: Any, actions: NDArray[Any], first: NDArray[np.int64]) -> Any:
-        parts = (*(observation if isinstance(observation, tuple) else (observation,)), actions)
-        if self._antialias:
-            parts = (*parts, first)
+        parts = observation if isinstance(observation, tuple) else (observation,)
+        parts = (*parts, *compress((actions, first), self._is_added))
         if self._flat is None:
             return parts
         columns = [_flattened(space, part) for space, part in zip(self._parts, parts, strict=True)]

@@ -115,6 +115,14 @@ impl Checkpoint {
     /// [`Error::Checkpoint`] if there is none.
     pub fn read(path: &Path) -> Result<Self, Error> {
         let path = if path.is_dir() { path.join(FOLDER).join(LAST) } else { path.to_owned() };
+        if !path.exists() && path.with_extension("pt").exists() {
+            let run = path.parent().and_then(Path::parent).unwrap_or(&path).display();
+            let what = format!(
+                "is one of endless-train; continue it with: endless-train --resume {run}; or write its weights for --init-from with: \
+                 python -m endless_gym_agents.export {run} --weights FILE.safetensors"
+            );
+            return Err(Error::Checkpoint { path: path.with_extension("pt"), what });
+        }
         if !path.exists() {
             return Err(Error::Checkpoint { path, what: "does not exist".to_owned() });
         }
