@@ -36,7 +36,7 @@ def make_vec(
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
     autoreset: AutoresetName | AutoresetMode = "next_step",
-    observation: ObservationName = "rgb",
+    observation: ObservationName | None = None,
     frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
@@ -70,7 +70,7 @@ def make_vec(
             environment of all groups.
         autoreset: Gymnasium's auto-reset mode: `next_step`, `same_step` or `disabled`.
         observation: `rgb` for frames, `features` for a vector that describes what the frame shows, without drawing it, or
-            `rgb+features` for a dict of both.
+            `rgb+features` for a dict of both. `None` for frames, or features in environments without frames.
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.

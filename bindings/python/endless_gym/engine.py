@@ -126,7 +126,7 @@ def serve(
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
     autoreset: AutoresetName | AutoresetMode = "next_step",
-    observation: ObservationName = "rgb",
+    observation: ObservationName | None = None,
     frames: Frames | None = None,
     batches_held: int = 4,
     checkpoint: str | os.PathLike[str] | None = None,

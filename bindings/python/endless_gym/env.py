@@ -48,7 +48,7 @@ class Env(gymnasium.Env[Any, Any]):
             (336, 336, 3); both indexed `[row][column][channel]`. `human`: every step shows that view in a window (needs pygame).
         options: Reset parameters for every episode. Options of `reset` override them.
         observation: `rgb` for frames, `features` for a vector that describes what the frame shows, or `rgb+features` for a dict
-            of both, as for `make_vec`.
+            of both, as for `make_vec`. `None` for frames, or features in environments without frames.
         frames: Format of the frames, as for `make_vec`. `None` for the original's format, which `render` always uses.
         view: What `rgb_array` and `human` show instead of the above: `agent` for the frame, `ground_truth` for the ground-truth
             view, for tools that know only Gymnasium's own render modes.
@@ -70,7 +70,7 @@ class Env(gymnasium.Env[Any, Any]):
         render_mode: str | None = None,
         options: dict[str, Any] | None = None,
         *,
-        observation: ObservationName = "rgb",
+        observation: ObservationName | None = None,
         frames: Frames | None = None,
         view: View | None = None,
         independent_episodes: bool = False,

@@ -163,6 +163,11 @@ class Spec:
         )
 
     @property
+    def default_observation(self) -> ObservationName:
+        """The observation that an environment has unless another is requested: frames if there are any."""
+        return "features" if self.frame is None else "rgb"
+
+    @property
     def branches(self) -> tuple[int, ...]:
         """Number of choices of each branch of the action space; none for a Box."""
         described = self.described_actions
@@ -297,20 +302,18 @@ def spec(id: str) -> Spec:
     return _SPECS[name]
 
 
-def contents(described: Spec, observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """The format of the frames, `None` without frames, and whether a batch has the feature observation.
-
-    An environment without frames has its features for `rgb`, too.
-    """
+def contents(described: Spec, observation: ObservationName | None, frames: Frames | None) -> tuple[Frames | None, bool]:
+    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
+    if observation is None:
+        observation = described.default_observation
     if not isinstance(observation, str) or observation not in OBSERVATIONS:
         raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
     if frames is not None and not isinstance(frames, Frames):
         raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
     has_frames, has_features = OBSERVATIONS[observation]
-    if described.frame is None:
-        if frames is not None or observation == "rgb+features":
-            raise ValueError(f"{described.id} has no frames, only features")
-        return None, True
+    if described.frame is None and (has_frames or frames is not None):
+        given = f'observation="{observation}"' if has_frames else f"frames={frames}"
+        raise ValueError(f'{described.id} has no frames; use observation="features" without frames, got {given}')
     if frames is not None and not has_frames:
         raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
     return (frames or Frames()) if has_frames else None, has_features

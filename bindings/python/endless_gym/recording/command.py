@@ -212,7 +212,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="JSON",
         help="reset parameters as a JSON object; if repeated, episodes cycle through them",
     )
-    add("--observation", default="rgb", metavar="KIND", help="rgb, features or rgb+features [default: rgb]")
+    add(
+        "--observation", metavar="KIND", help="rgb, features or rgb+features [default: rgb, or features without frames]"
+    )
     add("--grayscale", action="store_true", help="frames without colours")
     add("--channels-first", action="store_true", help="frames with the channel as the first axis")
     add("--row-major", action="store_true", help="frames indexed [row][column] [default: [x][y]]")

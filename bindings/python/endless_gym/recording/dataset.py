@@ -83,12 +83,12 @@ class DatasetWriter:
         overwrite: bool = False,
     ) -> None:
         self.dataset = check_id(dataset)
-        self.root = Path(get_dataset_path() if root is None else root)
+        # Absolute, since Minari joins relative paths twice.
+        self.root = Path(get_dataset_path() if root is None else root).absolute()
         #: The folder of the data set.
         self.path = self.root / dataset
         self._spaces = observation_space, action_space
         self._env_spec, self._metadata, self._overwrite = env_spec, metadata, overwrite
-        self._is_dict = isinstance(observation_space, gymnasium.spaces.Dict)
         self.episodes, self.steps = 0, 0
         self._check_place()
 
@@ -138,14 +138,7 @@ class DatasetWriter:
         }
         for name, value in attributes.items():
             group.attrs[name] = value
-        if self._is_dict:
-            observations = group.create_group("observations")
-            for key, chunks in episode.observations.items():
-                _write(observations, key, chunks)
-        else:
-            (chunks,) = episode.observations.values()
-            _write(group, "observations", chunks)
-        for name, chunks in episode.arrays.items():
+        for name, chunks in (episode.observations | episode.arrays).items():
             _write(group, name, chunks)
         infos = group.create_group("infos")
         if episode.ground_truth is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +41,7 @@ class Episode:
 
     Attributes:
         plan: The plan that was played.
-        observations: T + 1 observations by their keys.
+        observations: T + 1 observations by their paths in the data set's file, such as `observations/_index_0`.
         arrays: `actions` int64, or float32 of a Box, `rewards` float64, `terminations` and `truncations` bool, with T rows.
         ground_truth: T + 1 rows of `info["ground_truth"]`, float64; `None` if the environment has none.
         length: T.
@@ -104,31 +104,34 @@ def play(
         frames=frames if OBSERVATIONS[shown][0] else None,
     ) as envs:
         observed, info = envs.reset()
-        keys = {"rgb": ["visual_observation"], "features": ["features"]}.get(observation)
-        recorded = [*(keys or ["visual_observation", "features"])]
-        recorded += ["vector_observation"] if spec.vector_observation else []
+        kinds = zip(("visual_observation", "features"), OBSERVATIONS[observation], strict=True)
+        keys = [key for key, is_recorded in kinds if is_recorded]
+        keys += ["vector_observation"] if spec.vector_observation else []
         single = "visual_observation" if shown == "rgb" else "features"
 
         def parts(given: Any) -> Mapping[str, NDArray[Any]]:
             return given if isinstance(given, Mapping) else {single: given}
 
+        def recorded() -> Iterator[tuple[str, NDArray[Any]]]:
+            return _leaves("observations", {key: now[key] for key in keys} if len(keys) > 1 else now[keys[0]])
+
         now = parts(observed)
-        growing = {key: GrowingArrays(num_envs, now[key].shape[1:], now[key].dtype) for key in recorded}
+        growing = {path: GrowingArrays(num_envs, part.shape[1:], part.dtype) for path, part in recorded()}
         active = np.ones(num_envs, dtype=np.bool_)
         start = np.ones(num_envs, dtype=np.bool_)
         limits = np.array([np.inf if plan.max_steps is None else plan.max_steps for plan in plans])
         truths, actions, rewards = [_copied(info)], [], []
         episodes: list[Episode | None] = [None] * num_envs
-        for key, arrays in growing.items():
-            arrays.append(now[key], active)
+        for path, part in recorded():
+            growing[path].append(part, active)
         while active.any():
             if stop.is_set():
                 raise Stopped
             action = errors.apply(actor(now, start, active))
             observed, reward, terminated, truncated, info = envs.step(action)
             now = parts(observed)
-            for key, arrays in growing.items():
-                arrays.append(now[key], active)
+            for path, part in recorded():
+                growing[path].append(part, active)
             truths.append(_copied(info))
             actions.append(action)
             rewards.append(reward.copy())
@@ -139,6 +142,17 @@ def play(
                 active[env] = False
             start[:] = False
     return [episode for episode in episodes if episode is not None]
+
+
+def _leaves(path: str, observation: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays of an observation by their paths in Minari's files."""
+    if isinstance(observation, tuple):
+        observation = {f"_index_{index}": part for index, part in enumerate(observation)}
+    if not isinstance(observation, Mapping):
+        yield path, observation
+        return
+    for name, part in observation.items():
+        yield from _leaves(f"{path}/{name}", part)
 
 
 def _copied(info: Mapping[str, Any]) -> NDArray[np.float64] | None:

@@ -65,7 +65,7 @@ def record(
     action_seed: int = 0,
     options: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
     max_steps: int | None = None,
-    observation: ObservationName = "rgb",
+    observation: ObservationName | None = None,
     frames: Frames | None = None,
     dataset: str | None = None,
     root: str | os.PathLike[str] | None = None,
@@ -91,7 +91,7 @@ def record(
         action_seed: Seed of the random actions, and of an agent's.
         options: Reset parameters by the original's names: one mapping, or several, through which episodes cycle.
         max_steps: Truncate episodes after this number of steps. `None`: after 1,000 if the environment has no step limit.
-        observation: `rgb`, `features` or `rgb+features`, as for `make_vec`.
+        observation: `rgb`, `features`, `rgb+features` or `None`, as for `make_vec`.
         frames: Format of the frames, as for `make_vec`.
         dataset: Id of the data set; `None` for `endless-gym/ID/expert-v0`, or with `random` in its place.
         root: Folder of the data sets; `None` for Minari's.
@@ -132,6 +132,7 @@ def record(
         )
         for number in range(count)
     ]
+    observation = observation or described.default_observation
     frames, has_features = contents(described, observation, frames)
     threads = integer("num_threads", num_threads or _native.cores(), 1, _native.MAX_THREADS)
     name = dataset or f"endless-gym/{described.id}/{_short(player)}-v0"
@@ -223,7 +224,7 @@ def _env_spec(
     env_spec.kwargs["independent_episodes"] = True
     if len(options) == 1 and options[0]:
         env_spec.kwargs["options"] = dict(options[0])
-    if observation != "rgb":
+    if observation != described.default_observation:
         env_spec.kwargs["observation"] = observation
     return env_spec
 

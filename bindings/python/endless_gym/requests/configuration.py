@@ -63,7 +63,7 @@ def checked_arguments(
     seeds: range | Sequence[int] | None,
     options: Options | Sequence[Options] | None,
     autoreset: AutoresetName | AutoresetMode,
-    observation: ObservationName,
+    observation: ObservationName | None,
     frames: Frames | None,
     independent_episodes: bool,
     first_env: int,
