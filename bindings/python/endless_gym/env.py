@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -17,7 +18,20 @@ from endless_gym.display.rendering import SINGLE_MODES, SnapshotRenderer, View, 
 from endless_gym.display.window import Window, WindowClosed
 from endless_gym.specs import Frames, ObservationName, all_specs, contents, json_text, options_text, spec
 
-Observation = NDArray[Any] | dict[str, NDArray[Any]]
+Observation = NDArray[Any] | int | tuple[Any, ...] | dict[str, NDArray[Any]]
+
+#: The types of the original's rewards where they are not floats, by what ids contain: functions of the reward and of whether the
+#: step ended the episode.
+_REWARDS: dict[str, Callable[[float, bool], float]] = {
+    "MortarMayhem": lambda reward, ended: reward if ended else reward or 0,
+    "Pendulum": lambda reward, ended: np.float64(reward),
+    "LabyrinthExplore": lambda reward, ended: np.float64(reward) if reward > 0 else reward,
+    **dict.fromkeys(
+        ("Autoencode", "RepeatPrevious", "HigherLower", "Concentration"), lambda reward, ended: reward or 0
+    ),
+}
+#: The final infos that are NumPy's floats in the original.
+_NUMPY_FLOATS = ("commands_completed", "coins_collected")
 
 
 @documented(spec for spec in all_specs().values() if spec.frame)
@@ -88,6 +102,7 @@ class Env(gymnasium.Env[Any, Any]):
         self.has_ground_truth_info = self._spec.ground_truth > 0
         if self.has_ground_truth_info:
             self.ground_truth_space = self._spec.ground_truth_space()
+        self._typed_reward = [name for name in _REWARDS if name in id and self._spec.native is _native]
         self._truth_dtype = np.int64 if self._spec.ground_truth_is_integer else np.float64
         self._options = mapping("options", options)
         self._native = self._new_native()
@@ -160,7 +175,7 @@ class Env(gymnasium.Env[Any, Any]):
             >>> while not terminated:
             ...     observation, reward, terminated, truncated, info = env.step(0)
             >>> reward, info
-            (0.0, {'reward': 0.0, 'length': 10, 'success': 1, 'commands_completed': 1.0, 'task_progress': 0.0})
+            (0.0, {'reward': 0.0, 'length': 10, 'success': 1, 'commands_completed': np.float64(1.0), 'task_progress': 0.0})
 
         Raises:
             ResetNeeded: The environment has not been reset.
@@ -176,7 +191,9 @@ class Env(gymnasium.Env[Any, Any]):
         if end is not None:
             info["reward"], info["length"], values = end
             for (name, is_integer), value in zip(self._spec.info, values, strict=True):
-                info[name] = int(value) if is_integer else value
+                info[name] = int(value) if is_integer else np.float64(value) if name in _NUMPY_FLOATS else value
+        for name in self._typed_reward:
+            reward = _REWARDS[name](reward, end is not None)
         self._is_shown = False
         if self.render_mode == "human":
             self._show()
@@ -274,7 +291,7 @@ class Env(gymnasium.Env[Any, Any]):
     def _observation(self, arrays: _native.SingleArrays) -> Observation:
         frames, features, vector, _ = arrays
         if features is not None:
-            features = self._spec.feature_observation(features)
+            features = self._spec.single_observation(features)
         parts = {"visual_observation": frames, "features": features, "vector_observation": vector}
         given = {key: array for key, array in parts.items() if array is not None}
         return given if len(given) > 1 else next(iter(given.values()))

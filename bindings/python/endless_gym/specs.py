@@ -221,6 +221,11 @@ class Spec:
         """Features, float32 (..., features), as observations of the feature space, without a copy where that is a Box."""
         return features if self.described_features is None else _observation(self.described_features, features)
 
+    def single_observation(self, features: NDArray[np.float32]) -> Any:
+        """The feature observation of one environment, with the original's types: integers of Discrete spaces are Python's."""
+        observation = self.feature_observation(features)
+        return observation.astype(np.int32) if self.id.startswith("popgym-Labyrinth") else _integer(observation)
+
     def max_episode_steps(self, options: Mapping[str, Any]) -> int:
         """The step limit of an episode with these reset parameters, as in the original; -1 for none, and for an environment of an
         engine that this process does not have.
@@ -400,6 +405,13 @@ def _observation(described: dict[str, Any], features: NDArray[np.float32]) -> An
     ends = np.cumsum([_width(part) for part in value])
     parts = np.split(features, ends[:-1], axis=-1)
     return tuple(_observation(part, numbers) for part, numbers in zip(value, parts, strict=True))
+
+
+def _integer(part: Any) -> Any:
+    """The integer of an array without axes."""
+    if isinstance(part, tuple):
+        return tuple(map(_integer, part))
+    return part if part.ndim else part.item()
 
 
 def _meanings(described: Iterable[dict[str, str]]) -> tuple[Meaning, ...]:

@@ -5,10 +5,13 @@ A feature that an environment cannot have says why in one line when it is reques
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from original_types import types
 from support import same
 
 import endless_gym
@@ -23,6 +26,8 @@ IDS = [
     "popgym-PositionOnlyPendulumEasy-v0",
     "popgym-BattleshipEasy-v0",
 ]
+
+TYPES = json.loads(Path(__file__).with_name("original_types.json").read_text())
 
 
 def row(batch: Any, number: int) -> Any:
@@ -49,3 +54,44 @@ def test_data_sets_are_what_a_new_environment_plays(id: str, tmp_path: Path, mon
             for step, action in enumerate(episode.actions):
                 observation, reward, *_ = env.step(action)
                 same([row(episode.observations, step + 1), episode.rewards[step]], [observation, reward])
+
+
+@pytest.mark.parametrize("id", TYPES)
+def test_a_single_environment_returns_the_types_of_the_original(id: str) -> None:
+    given, wanted = types(endless_gym.Env(id)), TYPES[id]
+    assert (given["observation"], given["reward"]) == (wanted["observation"], wanted["reward"])
+    # The original's infos of POPGym are numbers of the ground truth.
+    if not id.startswith("popgym"):
+        assert {info for info in given["info"] if "task_progress" not in info} == set(wanted["info"])
+
+
+def test_discrete_observations_are_keys_and_json() -> None:
+    for id in ("popgym-RepeatFirstEasy-v0", "popgym-AutoencodeEasy-v0"):
+        observation, _ = endless_gym.Env(id).reset(seed=1)
+        assert json.dumps(observation) and {observation: 1}
+    envs = endless_gym.make_vec("popgym-RepeatFirstEasy-v0", 1, autoreset="same_step", seed=1)
+    envs.reset()
+    steps = (envs.step([0])[4] for _ in range(60))
+    assert {type(info["final_obs"][0]) for info in steps if "final_obs" in info} == {int}
+
+
+def test_arrays_are_options() -> None:
+    options = {"command_show_duration": np.array([9])}
+    assert endless_gym.spec("MortarMayhem-v0").max_episode_steps(options) == 335
+    env = endless_gym.Env("MortarMayhem-v0")
+    env.reset(options=options)
+    assert env.max_episode_steps == 335
+    assert endless_gym.make_vec("MortarMayhem-v0", 1, options=options).max_episode_steps == [335]
+
+
+def test_a_step_of_concentration_after_its_end_is_not_another_end() -> None:
+    env, experts = endless_gym.Env("popgym-ConcentrationEasy-v0"), endless_gym.Experts("popgym-ConcentrationEasy-v0")
+    observation, _ = env.reset(seed=1)
+    is_first, terminated, truncated = np.array([True]), False, False
+    while not (terminated or truncated):
+        action = int(experts.act(observation[None], is_first)[0])
+        observation, _, terminated, truncated, _ = env.step(action)
+        is_first = np.array([False])
+    assert terminated
+    # As in the original, whose two cards stay face up.
+    assert env.step(0)[1:4] == (pytest.approx(-1 / 104), False, False)

@@ -118,7 +118,7 @@ impl Task for Concentration {
         }
         let is_found = self.is_found(card);
         self.steps = self.steps.saturating_add(1);
-        let mut reward = 0.0;
+        let (mut reward, mut terminated) = (0.0, false);
         match first {
             None if is_found => reward = parameters.failure,
             None => self.first = Some(card),
@@ -127,12 +127,13 @@ impl Task for Concentration {
                 if is_pair && !is_found && first != card {
                     self.found |= 1 << first | 1 << card;
                     reward = parameters.pair;
+                    // As in the original, a step after the end is not another end.
+                    terminated = self.found.count_ones() as usize == self.deck.cards().len();
                 } else {
                     reward = 2.0 * parameters.failure;
                 }
             }
         }
-        let terminated = self.found.count_ones() as usize == self.deck.cards().len();
         Transition { reward, terminated, truncated: self.steps >= parameters.length }
     }
 

@@ -73,6 +73,7 @@ impl Task for CountRecall {
                 features: FEATURES,
                 observation_space: Some(ObservationSpace::MultiDiscrete(kinds)),
                 ground_truth,
+                ground_truth_is_integer: true,
                 ..EnvSpec::new(id, summary, actions)
             }
         };

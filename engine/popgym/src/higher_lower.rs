@@ -54,6 +54,7 @@ impl Task for HigherLower {
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(13)),
             ground_truth: GROUND_TRUTH,
+            ground_truth_is_integer: true,
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(2))
         }
     }

@@ -137,6 +137,7 @@ impl Task for Labyrinth {
                 features,
                 observation_space: Some(SPACE),
                 ground_truth: GROUND_TRUTH,
+                ground_truth_is_integer: true,
                 ..EnvSpec::new(id, summary, ActionSpace::Discrete(4))
             })
         });

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -79,12 +79,13 @@ class Results:
         return tuple(array.copy() for array in arrays) if self.copy else arrays
 
     def _observation(self, arrays: _native.Arrays) -> Any:
-        return self._named({key: arrays[place] for key, place in self._observed})
+        parts = {key: arrays[place] for key, place in self._observed}
+        return self._named(parts, self.described.feature_observation)
 
-    def _named(self, parts: dict[str, Any]) -> Any:
-        """The parts as a dict, or the only one."""
+    def _named(self, parts: dict[str, Any], observed: Callable[[Any], Any]) -> Any:
+        """The parts as a dict, or the only one; `observed` makes an observation of features."""
         if "features" in parts:
-            parts["features"] = self.described.feature_observation(parts["features"])
+            parts["features"] = observed(parts["features"])
         return parts if len(parts) > 1 else next(iter(parts.values()))
 
     def _info(self, arrays: _native.Arrays) -> dict[str, Any]:
@@ -113,5 +114,6 @@ class Results:
             return
         observations = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
-            observations[env] = self._named({key: arrays[place][env] for key, place in self._final_observed})
+            parts = {key: arrays[place][env] for key, place in self._final_observed}
+            observations[env] = self._named(parts, self.described.single_observation)
         info["final_obs"], info["_final_obs"] = observations, ended
