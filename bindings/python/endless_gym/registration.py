@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +58,15 @@ def _register(specs: Iterable[Spec], namespace: str | None) -> None:
 
 
 def single(env_id: str, **kwargs: Any) -> Env:
-    """The entry point of `gymnasium.make`; keyword arguments are those of `Env`."""
+    """The entry point of `gymnasium.make`; keyword arguments are those of `Env`.
+
+    Where the package `popgym` is installed, an environment of POPGym is a `popgym.core.env.POPGymEnv`.
+    """
+    if env_id.startswith("popgym-"):
+        with suppress(ImportError):
+            from endless_gym.popgym_env import PopgymEnv
+
+            return PopgymEnv(env_id, **kwargs)
     return Env(env_id, **kwargs)
 
 

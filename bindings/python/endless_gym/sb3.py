@@ -52,14 +52,14 @@ class EndlessVecEnv(VecEnv):
     `step` and `reset` raise the same exceptions as those of `EndlessVectorEnv`.
     """
 
-    def __init__(self, envs: EndlessVectorEnv) -> None:
-        """Wrap `envs`, made by `make_vec`, `serve` or `connect` with same-step auto-reset and one group.
+    def __init__(self, envs: EndlessVectorEnv | gymnasium.vector.VectorWrapper) -> None:
+        """Wrap `envs`, made by `make_vec`, `serve` or `connect` with same-step auto-reset and one group, and maybe wrapped.
 
         Raises:
             ValueError: The environments have another auto-reset mode, several groups, or no final observations.
         """
-        check_adaptable(envs, gymnasium.vector.AutoresetMode.SAME_STEP, "Stable-Baselines3")
-        if not envs.has_final_observation:
+        self._own = check_adaptable(envs, gymnasium.vector.AutoresetMode.SAME_STEP, "Stable-Baselines3")
+        if not self._own.has_final_observation:
             raise ValueError(
                 "the engine must write final observations for Stable-Baselines3; start it with --final-observation"
             )
@@ -97,7 +97,7 @@ class EndlessVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         if any(options) or self._has_options:
-            self.envs.set_options(options)
+            self._own.set_options(options)
             self._has_options = any(options)
         observations: VecEnvObs
         observations, self.info = self.envs.reset(seed=None if seeds[0] is None else seeds)
@@ -130,7 +130,7 @@ class EndlessVecEnv(VecEnv):
         Stable-Baselines3 records and shows only pictures of the render mode `rgb_array`. They are the ground-truth views if the
         environments were made with `view="ground_truth"`.
         """
-        return self.envs.render() or [None] * self.num_envs
+        return self._own.render() or [None] * self.num_envs
 
     def close(self) -> None:
         """Close the environments."""
@@ -142,10 +142,10 @@ class EndlessVecEnv(VecEnv):
         """
         chosen = list(self._get_indices(indices))
         if attr_name in ("max_episode_steps", "reset_params"):
-            each = getattr(self.envs, attr_name)
+            each = getattr(self._own, attr_name)
             return [each[index] for index in chosen]
         own = attr_name in ("action_space", "observation_space")
-        value = getattr(self if own else self.envs, attr_name)
+        value = getattr(self if own else self._own, attr_name)
         return [value for _ in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:

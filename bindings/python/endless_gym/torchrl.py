@@ -20,7 +20,7 @@ import numpy as np
 try:
     import torch
     from tensordict import TensorDict, TensorDictBase
-    from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+    from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, TensorSpec, Unbounded
     from torchrl.envs import EnvBase
 except ImportError as error:
     raise ImportError("endless_gym.torchrl needs TorchRL: pip install torchrl tensordict") from error
@@ -52,13 +52,15 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
     `step` and `reset` raise the same exceptions as those of `EndlessVectorEnv`.
     """
 
-    def __init__(self, envs: EndlessVectorEnv, device: torch.device | str = "cpu") -> None:
-        """Wrap `envs`, made by `make_vec`, `serve` or `connect` with disabled auto-reset and one group.
+    def __init__(
+        self, envs: EndlessVectorEnv | gymnasium.vector.VectorWrapper, device: torch.device | str = "cpu"
+    ) -> None:
+        """Wrap `envs`, made by `make_vec`, `serve` or `connect` with disabled auto-reset and one group, and maybe wrapped.
 
         Raises:
             ValueError: The environments have another auto-reset mode, or several groups.
         """
-        check_adaptable(envs, gymnasium.vector.AutoresetMode.DISABLED, "TorchRL")
+        described = check_adaptable(envs, gymnasium.vector.AutoresetMode.DISABLED, "TorchRL")._described
         super().__init__(device=device, batch_size=[envs.num_envs])
         self.envs = envs
         self._seed: int | None = None
@@ -66,7 +68,6 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
         spaces = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
         batch = self.batch_size
         entries = {key: _observation_spec(space, batch, self.device) for key, space in spaces.items()}
-        described = envs._described
         if described.ground_truth:
             entries["ground_truth"] = Unbounded(
                 shape=(*batch, described.ground_truth), dtype=torch.float64, device=self.device
@@ -187,6 +188,10 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
 
 
 def _observation_spec(space: gymnasium.Space[Any], batch: torch.Size, device: torch.device) -> TensorSpec:
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return Categorical(int(space.n), shape=batch, device=device)
+    if isinstance(space, gymnasium.spaces.MultiDiscrete):
+        return MultiCategorical(space.nvec.tolist(), shape=torch.Size((*batch, *space.shape)), device=device)
     assert isinstance(space, gymnasium.spaces.Box)
     dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
     if not space.is_bounded():
@@ -196,9 +201,8 @@ def _observation_spec(space: gymnasium.Space[Any], batch: torch.Size, device: to
 
 
 def _action_spec(space: gymnasium.Space[Any], batch: torch.Size, device: torch.device) -> TensorSpec:
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return Categorical(int(space.n), shape=batch, device=device)
-    assert isinstance(space, gymnasium.spaces.MultiDiscrete)
+    if not isinstance(space, gymnasium.spaces.MultiDiscrete):
+        return _observation_spec(space, batch, device)
     # All branches have the same number of choices, so a Categorical with one more dimension describes them.
     (values,) = set(space.nvec.tolist())
     return Categorical(values, shape=torch.Size((*batch, len(space.nvec))), device=device)

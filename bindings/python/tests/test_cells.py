@@ -6,15 +6,18 @@ A feature that an environment cannot have says why in one line when it is reques
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from original_types import types
 from support import same
 
 import endless_gym
+from endless_gym.popgym import PreviousAction
 
 #: An environment of each suite and of each kind of observation and action space.
 IDS = [
@@ -95,3 +98,64 @@ def test_a_step_of_concentration_after_its_end_is_not_another_end() -> None:
     assert terminated
     # As in the original, whose two cards stay face up.
     assert env.step(0)[1:4] == (pytest.approx(-1 / 104), False, False)
+
+
+POPGYM = [id for id in endless_gym.all_specs() if id.startswith("popgym-") and "Easy" in id]
+
+
+@pytest.mark.libraries
+def test_recurrent_ppo_of_stable_baselines_plays_all_of_popgym() -> None:
+    pytest.importorskip("sb3_contrib")
+    from sb3_contrib import RecurrentPPO
+    from stable_baselines3.common.monitor import Monitor
+
+    from endless_gym.sb3 import EndlessVecEnv
+
+    for id in POPGYM:
+        envs = endless_gym.make_vec(id, 2, autoreset="same_step", seed=1)
+        venv = EndlessVecEnv(PreviousAction(envs, flatten=True))
+        assert venv.get_attr("max_episode_steps") and venv.env_is_wrapped(Monitor) == [True, True]
+        small = {"lstm_hidden_size": 4, "net_arch": [4]}
+        RecurrentPPO("MlpLstmPolicy", venv, n_steps=4, batch_size=8, n_epochs=1, policy_kwargs=small).learn(8)
+    with pytest.raises(ValueError, match=r"must not be tuples .*PreviousAction\(envs, flatten=True\)"):
+        EndlessVecEnv(endless_gym.make_vec("popgym-AutoencodeEasy-v0", 1, autoreset="same_step"))
+
+
+@pytest.mark.libraries
+def test_torchrl_plays_all_of_popgym() -> None:
+    pytest.importorskip("torchrl")
+    from endless_gym.torchrl import EndlessEnv
+
+    for id in POPGYM:
+        with endless_gym.make_vec(id, 2, autoreset="disabled", seed=1) as envs:
+            data = EndlessEnv(PreviousAction(envs, flatten=True)).rollout(3)
+            assert data["observation"].shape[0] == 2
+        if "Tuple" not in str(envs.single_observation_space):
+            assert EndlessEnv.make(id, 2).rollout(3)["observation"].shape[0] == 2
+
+
+@pytest.mark.libraries
+@pytest.mark.parametrize("id", POPGYM)
+def test_the_wrappers_of_popgym_take_single_environments(id: str) -> None:
+    wrappers = pytest.importorskip("popgym.wrappers")
+    env = gymnasium.make(f"EndlessGym/{id}")
+    wrapped = wrappers.Flatten(wrappers.Antialias(wrappers.PreviousAction(env)))
+    if not isinstance(env.action_space, gymnasium.spaces.Box):
+        wrapped = wrappers.DiscreteAction(wrapped)
+    vectors = PreviousAction(endless_gym.make_vec(id, 1), flatten=True)
+    single, (batch, _) = wrapped.reset(seed=1)[0], vectors.reset(seed=1)
+    np.testing.assert_array_equal(single, batch[0])
+    wrapped.action_space.seed(1)
+    for _ in range(20):
+        action = wrapped.action_space.sample()
+        given = action
+        if isinstance(env.action_space, gymnasium.spaces.MultiDiscrete):
+            given = np.array(np.unravel_index(action, env.action_space.nvec))
+        (single, _, terminated, truncated, _), (batch, *_) = wrapped.step(action), vectors.step(np.asarray(given)[None])
+        np.testing.assert_array_equal(single, batch[0])
+        if terminated or truncated:
+            break
+    assert env.obs_requires_prev_action == any(name in id for name in ("Band", "Battle", "Conc", "Mine", "Lab"))
+    with pytest.raises(NotImplementedError, match=f"{id} has no hidden state"):
+        wrapped.get_state()
+    assert pickle.loads(pickle.dumps(env)).obs_requires_prev_action == env.obs_requires_prev_action
