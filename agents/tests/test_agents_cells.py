@@ -1,11 +1,14 @@
 """What the agents' programs offer, for every kind of environment: programs down, environments across."""
 
+import re
+import sys
 from pathlib import Path
 
 import pytest
 
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import make_agent
+from endless_gym_agents.evaluation import enjoy
 from endless_gym_agents.settings import ONE_HOT, VECTORS, Settings, from_dict, to_dict
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.train import parse, train
@@ -36,8 +39,17 @@ def test_integers_become_vectors_without_a_flag(id: str) -> None:
     assert shapes == [{"features": (entries,)} for entries in ENTRIES[id]]
 
 
-def test_a_run_in_an_environment_of_integers_resumes(tmp_path: Path) -> None:
+def test_a_run_in_an_environment_of_integers_resumes_and_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     small = "--environment.num-envs 2 --ppo.steps 4 --ppo.minibatches 1 --recurrence.hidden-size 8 --ppo.updates 2"
     run = train(parse(f"--env popgym-AutoencodeEasy-v0 --preset quick {small} --run {tmp_path / 'run'}".split()))
     train(parse(f"--resume {run} --ppo.updates 3".split()))
     assert checkpoint.load(run).update == 3
+    monkeypatch.setattr(sys, "argv", ["endless-enjoy", str(run), "--max-steps", "3"])
+    assert enjoy.main() == 0
+    lines = capsys.readouterr().out.splitlines()[-8:]
+    assert lines[0].endswith("seed 200000  step 0") and re.fullmatch(
+        r"    mode 1  suit (spades|diamonds|clubs|hearts)", lines[1]
+    )
+    assert lines[6].split("  ")[2] == "step 3"

@@ -1,4 +1,6 @@
-"""`endless-enjoy`: record a video of a trained agent, with its frames next to the ground-truth view.
+"""`endless-enjoy`: record a video of a trained agent, or, in environments without frames, print what it sees.
+
+A video shows its frames next to the ground-truth view.
 
 ```console
 endless-enjoy runs/mine                                        # one episode, as animated WebP
@@ -71,15 +73,16 @@ class EpisodeRecorder:
     rewards: list[float] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
 
-    def frames(self, seeds: tuple[int, ...]) -> Iterator[video.Frame]:
-        """Generate a frame for the start and for each step of the episodes with these seeds; the last frame lasts one second."""
+    def frames(self, seeds: tuple[int, ...]) -> Iterator[Any]:
+        """Generate a frame, or a text, for the start and each step of the episodes; the last frame lasts one second."""
         generator = torch.Generator(self.agent.device).manual_seed(self.action_seed)
         for seed in seeds:
             # Like the original, an environment keeps some state between episodes; a new one gives the same video for a seed.
-            with wrappers.make(self.agent.settings, 1, 1, autoreset="disabled", render_mode="rgb_array") as envs:
+            mode = "rgb_array" if spec(self.agent.settings.env).frame else "ansi"
+            with wrappers.make(self.agent.settings, 1, 1, autoreset="disabled", render_mode=mode) as envs:
                 yield from self._episode(envs, seed, generator)
 
-    def _episode(self, envs: Any, seed: int, generator: torch.Generator) -> Iterator[video.Frame]:
+    def _episode(self, envs: Any, seed: int, generator: torch.Generator) -> Iterator[Any]:
         settings, memory = self.agent.settings, self.agent.initial_memory(1)
         env_spec = spec(settings.env)
         observation, _ = envs.reset(seed=[seed])
@@ -98,13 +101,15 @@ class EpisodeRecorder:
             text += f"  reward {self.rewards[-1]:.2f}"
             frame = self._frame(envs.unwrapped, text + ("  end" if done else ""))
             yield frame
-        for _ in range(env_spec.render_fps):
+        for _ in range(env_spec.render_fps if env_spec.frame else 0):
             yield frame
 
     @staticmethod
-    def _frame(envs: EndlessVectorEnv, text: str) -> video.Frame:
+    def _frame(envs: EndlessVectorEnv, text: str) -> Any:
         # Drawn by the environment, since the agent may observe features, or what a wrapper makes of the frame.
         (frame,) = envs.render() or ()
+        if isinstance(frame, str):
+            return f"{text}\n    {frame}"
         return video.compose(frame, envs.ground_truth_view(0), text)
 
 
@@ -116,6 +121,10 @@ def execute(arguments: EnjoyArguments) -> None:
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)
     console = command.Terminal()
+    if spec(agent.settings.env).frame is None:
+        for text in recorder.frames(arguments.seeds):
+            print(text)
+        return
     with command.Terminal(stderr=True).status(f"playing {agent.settings.env}"):
         video.write(
             arguments.out, recorder.frames(arguments.seeds), arguments.fps or spec(agent.settings.env).render_fps

@@ -9,7 +9,7 @@ from typing import Any
 from endless_gym import _native
 from endless_gym.arguments import named
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.display.rendering import VECTOR_MODES, View, checked_view
+from endless_gym.display.rendering import TEXT_MODES, VECTOR_MODES, View, checked_view
 from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
 from endless_gym.interop import PageLocks, cuda_to_pin, page_locked_bytes
 from endless_gym.requests.configuration import (
@@ -83,7 +83,8 @@ def make_vec(
         first_env: Number of the first environment, for seeds, if the environments of one trainer are divided among several calls,
             for example one for each rank of a data-parallel run: environment `i` is numbered `first_env + i`.
         total_envs: Total number of environments of all these calls; `None` for `first_env` plus those of this call.
-        render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views.
+        render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views; without frames,
+            `ansi` for texts of what the agents see.
         view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
         episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between
             steps, before the step in which the episode may begin; with same-step auto-reset, that is one episode ahead.
@@ -157,7 +158,7 @@ def connect(
             given, or the engine lends only the batch that `pin_memory` holds.
     """
     timeout = checked_timeout(timeout)
-    checked_view(render_mode, view, VECTOR_MODES)
+    checked_view(render_mode, view, VECTOR_MODES | TEXT_MODES)
     cuda = cuda_to_pin(pin_memory, copy)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())

@@ -14,7 +14,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.display.descriptions import documented, metadata
 from endless_gym.display.keyboard import keys_to_action
-from endless_gym.display.rendering import SINGLE_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.display.rendering import SINGLE_MODES, TEXT_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.display.window import Window, WindowClosed
 from endless_gym.specs import Frames, ObservationName, all_specs, contents, json_text, options_text, spec
 
@@ -60,6 +60,7 @@ class Env(gymnasium.Env[Any, Any]):
         id: Environment id, such as `MortarMayhem-v0`.
         render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
             (336, 336, 3); both indexed `[row][column][channel]`. `human`: every step shows that view in a window (needs pygame).
+            `ansi`, in environments without frames and only there: what the agent sees as text, such as `suit hearts`.
         options: Reset parameters for every episode. Options of `reset` override them.
         observation: `rgb` for frames, `features` for a vector that describes what the frame shows, or `rgb+features` for a dict
             of both, as for `make_vec`. `None` for frames, or features in environments without frames.
@@ -74,7 +75,7 @@ class Env(gymnasium.Env[Any, Any]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
-        "render_modes": list(SINGLE_MODES),
+        "render_modes": [*SINGLE_MODES, *TEXT_MODES],
         "render_fps": 25,
     }
 
@@ -90,12 +91,13 @@ class Env(gymnasium.Env[Any, Any]):
         independent_episodes: bool = False,
     ) -> None:
         self._spec = spec(id)
-        self._view = checked_view(render_mode, view, SINGLE_MODES)
+        modes = SINGLE_MODES if self._spec.frame else TEXT_MODES
+        self._view = checked_view(render_mode, view, modes)
         self._frames, self._features = contents(self._spec, observation, frames)
         self._independent_episodes = bool(independent_episodes)
-        # The frame rate and the meanings differ from id to id.
-        fps = {"render_fps": self._spec.render_fps}
-        self.metadata = {**type(self).metadata, **fps, **metadata(self._spec)}  # type: ignore[misc]
+        # Render modes, frame rate and meanings differ from id to id.
+        rendering = {"render_modes": list(modes), "render_fps": self._spec.render_fps}
+        self.metadata = {**type(self).metadata, **rendering, **metadata(self._spec)}  # type: ignore[misc]
         self.render_mode = render_mode
         self.action_space = self._spec.action_space()
         self.observation_space = self._spec.observation_space(self._frames, self._features)
@@ -199,8 +201,8 @@ class Env(gymnasium.Env[Any, Any]):
             self._show()
         return self._observation(arrays), reward, terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The current frame or view of the render mode; `None` for `human` and without a render mode."""
+    def render(self) -> Any:
+        """The current frame, view or text of the render mode; `None` for `human` and without a render mode."""
         if self.render_mode == "human":
             # `reset` and `step` show the picture, as Gymnasium requires; in the original only `render` does.
             self._check_window()
@@ -268,7 +270,9 @@ class Env(gymnasium.Env[Any, Any]):
         if self._was_closed:
             raise WindowClosed("the window was closed; call `env.close()`, after which `env.reset()` opens another one")
 
-    def _picture(self) -> NDArray[np.uint8]:
+    def _picture(self) -> Any:
+        if self._view == "text":
+            return self._native.text()
         if self._view == "ground_truth":
             # In the original, each picture in this mode advances the clue that is shown. The other modes show the current step's.
             return self._native.ground_truth_view(self.render_mode != "debug_rgb_array")

@@ -18,7 +18,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.display.descriptions import documented, metadata
-from endless_gym.display.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.display.rendering import TEXT_MODES, VECTOR_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.interop import PageLocks
 from endless_gym.requests.configuration import Options
 from endless_gym.requests.exceptions import TooManyBatchesHeld
@@ -96,7 +96,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         page-locks the engine's memory.
         """
         described = results.described
-        shown = checked_view(render_mode, view, VECTOR_MODES)
+        modes = VECTOR_MODES if described.frame else TEXT_MODES
+        shown = checked_view(render_mode, view, modes)
         self.render_mode = render_mode
         self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)
         self._backend = backend
@@ -115,7 +116,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.metadata = {
             "autoreset_mode": results.autoreset,
             "render_fps": described.render_fps,
-            "render_modes": list(VECTOR_MODES),
+            "render_modes": list(modes),
         }
         self.metadata.update(metadata(described))
         #: Whether `info` has the last observation of an episode that ended, with same-step auto-reset.
@@ -382,8 +383,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             self._kept[group] = None
             return self._results.start(self._page_locked(group, arrays))
 
-    def render(self, group: int = 0) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
-        """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
+    def render(self, group: int = 0) -> tuple[Any, ...] | None:  # type: ignore[override]
+        """A picture of each environment of a group, indexed `[row][column][channel]`, or a text; `None` without a mode.
 
         With `rgb_array` it is the frame, uint8 (84, 84, 3), whatever the observation; with `debug_rgb_array`, or the view
         `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process from a snapshot,

@@ -72,6 +72,11 @@ impl Single {
         arrays::picture(py, rgb_array(Batch::new(self.pool.layout(), &self.blocks).observation(), shape))
     }
 
+    /// The features as text.
+    fn text(&self) -> String {
+        self.pool.spec().text(Batch::new(self.pool.layout(), &self.blocks).features())
+    }
+
     /// The ground-truth view, indexed \[row\]\[column\]\[channel\]: the one after the last view, as in the original, or that of the
     /// current step.
     fn ground_truth_view<'py>(&mut self, py: Python<'py>, of_current_step: bool) -> PyResult<Bound<'py, PyAny>> {

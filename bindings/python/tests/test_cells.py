@@ -5,8 +5,10 @@ A feature that an environment cannot have says why in one line when it is reques
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -159,3 +161,30 @@ def test_the_wrappers_of_popgym_take_single_environments(id: str) -> None:
     with pytest.raises(NotImplementedError, match=f"{id} has no hidden state"):
         wrapped.get_state()
     assert pickle.loads(pickle.dumps(env)).obs_requires_prev_action == env.obs_requires_prev_action
+
+
+@pytest.mark.parametrize("id", IDS)
+@pytest.mark.parametrize("where", ["single", "make_vec", "serve"])
+def test_environments_have_pictures_or_text(id: str, where: str) -> None:
+    def made(**arguments: Any) -> Any:
+        if where == "single":
+            return endless_gym.Env(id, **arguments)
+        return getattr(endless_gym, where)(id, 1, **arguments)
+
+    has_frames = endless_gym.spec(id).frame is not None
+    right, wrong = ("rgb_array", "ansi") if has_frames else ("ansi", "rgb_array")
+    with pytest.raises(ValueError, match=rf"^render_mode must be None or one of .*{right}.*, got '{wrong}'$"):
+        made(render_mode=wrong)
+    if not has_frames:
+        for observation in ("rgb", "rgb+features"):
+            with pytest.raises(ValueError, match=rf'{id} has no frames; use observation="features"'):
+                made(observation=observation)
+    with contextlib.closing(made(render_mode=right)) as env:
+        assert right in env.metadata["render_modes"] and wrong not in env.metadata["render_modes"]
+        env.reset(seed=1)
+        shown = env.render() if where == "single" else env.render()[0]
+        if has_frames:
+            assert shown.shape == (84, 84, 3)
+        else:
+            assert re.fullmatch(r"\S+ \S+(  \S+ \S+)*", shown)
+            assert ("spades" in shown or "hearts" in shown) or "Repeat" not in id

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from endless_gym import _native
 from endless_gym.specs import json_text, spec
 
-#: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3).
-View = Literal["agent", "ground_truth"]
+#: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3); or the
+#: text of what the agent sees, in environments without frames.
+View = Literal["agent", "ground_truth", "text"]
 
 #: The render modes of a single environment, with the views that each can show; the first is the original's.
 SINGLE_MODES: dict[str, tuple[View, ...]] = {
@@ -23,6 +24,9 @@ SINGLE_MODES: dict[str, tuple[View, ...]] = {
 
 #: The render modes of a vector environment.
 VECTOR_MODES = {mode: views for mode, views in SINGLE_MODES.items() if mode != "human"}
+
+#: The render modes of environments without frames.
+TEXT_MODES: dict[str, tuple[View, ...]] = {"ansi": ("text",)}
 
 
 def checked_view(render_mode: Any, view: Any, modes: dict[str, tuple[View, ...]]) -> View | None:
@@ -36,7 +40,8 @@ def checked_view(render_mode: Any, view: Any, modes: dict[str, tuple[View, ...]]
             raise ValueError(f"view must be None without a render_mode, got {view!r}")
         return None
     if not isinstance(render_mode, str) or render_mode not in modes:
-        raise ValueError(f"render_mode must be None or one of {', '.join(modes)}, got {render_mode!r}")
+        where = " in environments without frames" if modes is TEXT_MODES else ""
+        raise ValueError(f"render_mode must be None or one of {', '.join(modes)}{where}, got {render_mode!r}")
     views = modes[render_mode]
     if view is None:
         return views[0]
@@ -54,10 +59,12 @@ class SnapshotRenderer:
         self._native.reset(0, "{}")
         self._view = view
 
-    def render(self, snapshots: Iterable[bytes]) -> tuple[NDArray[np.uint8], ...]:
-        """One picture for each snapshot, indexed `[row][column][channel]`."""
+    def render(self, snapshots: Iterable[bytes]) -> tuple[Any, ...]:
+        """One picture for each snapshot, indexed `[row][column][channel]`, or one text."""
         return tuple(self._picture(snapshot) for snapshot in snapshots)
 
-    def _picture(self, snapshot: bytes) -> NDArray[np.uint8]:
+    def _picture(self, snapshot: bytes) -> NDArray[np.uint8] | str:
         self._native.restore(snapshot)
+        if self._view == "text":
+            return self._native.text()
         return self._native.rgb_array() if self._view == "agent" else self._native.ground_truth_view(True)

@@ -1,7 +1,7 @@
 //! One environment that a person plays.
 
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
-use endless_gym_core::envs::{Column, EnvSpec};
+use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::pool::{
     Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads,
 };
@@ -67,12 +67,7 @@ impl Game {
 
     /// What the agent sees of an environment without frames.
     pub fn features(&self) -> String {
-        let feature = |(column, value): (&Column, &f32)| match value.fract() {
-            0.0 => format!("{} {value}", column.name),
-            _ => format!("{} {value:.3}", column.name),
-        };
-        let features = self.spec().features.iter().zip(self.batch().features()).map(feature);
-        features.collect::<Vec<_>>().join("  ")
+        self.spec().text(self.batch().features())
     }
 
     /// Seed, steps and rewards.

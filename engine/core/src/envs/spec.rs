@@ -228,6 +228,19 @@ impl EnvSpec {
         }
     }
 
+    /// Features as text, such as `suit hearts  mines 2`. A feature that is named as a branch of the actions has the names of its choices.
+    pub fn text(&self, features: &[f32]) -> String {
+        let part = |(column, value): (&Column, &f32)| {
+            let branch = self.actions.iter().find(|branch| branch.name == column.name);
+            match branch.and_then(|branch| branch.choices.get(*value as usize)) {
+                Some(choice) => format!("{} {}", column.name, choice.name),
+                None if value.fract() == 0.0 => format!("{} {value}", column.name),
+                None => format!("{} {value:.3}", column.name),
+            }
+        };
+        self.features.iter().zip(features).map(part).collect::<Vec<_>>().join("  ")
+    }
+
     /// The maximum number of steps of an episode with the given reset parameters; `None` without a limit.
     ///
     /// # Errors
