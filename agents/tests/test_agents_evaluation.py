@@ -122,7 +122,7 @@ def test_a_foreign_run_does_not_prevent_the_evaluation_of_others(
     assert protocol.main() == 1
     output = capsys.readouterr()
     assert output.err.startswith(f"endless-eval: the others are evaluated; {foreign} is not a checkpoint"), output.err
-    assert "gru_16" in output.out and "none (ppo in the paper)" in output.out and "95 % of IQM" in output.out
+    assert "gru_16" in output.out and "none (ppo in the paper)" in output.out and "95 % of mean" in output.out
     written = json.loads((tmp_path / "all.json").read_text())
     assert [len(experiment["runs"]) for experiment in written["experiments"]] == [1, 1]
 

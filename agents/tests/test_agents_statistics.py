@@ -54,5 +54,7 @@ def test_summary() -> None:
     assert summary.mean == pytest.approx(21.2)
     assert summary.std == pytest.approx(1553.36**0.5)
     assert (summary.iqm, summary.low < 2.0 < summary.high) == (2.0, True)
+    episodes = summarise([1.0] * 47 + [0.0] * 3, of_runs=False)
+    assert episodes.iqm is None and episodes.low < 0.94 == pytest.approx(episodes.mean) and 0.94 < episodes.high <= 1
     with pytest.raises(ValueError, match="at least one number"):
         summarise([])

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -123,7 +124,9 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
         rows, colour = estimates(curve, spread), AGENTS.get(curve.label, (f"C{number}",))[0]
         steps = [row[0] / scale.unit for row in rows]
         style = "--" if curve.source == "published" else "-"
-        title = f"{curve.label} (paper)" if curve.source == "published" else curve.label
+        # The paper calls the agent without memory by its algorithm.
+        own = re.sub(r"^ppo\b", "none", curve.label)
+        title = f"{curve.label} (paper)" if curve.source == "published" else own
         marker = "o" if len(steps) == 1 else ""
         if spread == "runs":
             for run in range(len(curve.scores)):

@@ -159,8 +159,8 @@ def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] 
 def table(experiment: Experiment) -> Table:
     """A table with all metrics of the last checkpoint, and the paper's metric for the earlier ones.
 
-    The interval is the bootstrap interval of the interquartile mean (IQM), not of the mean. Final infos that count failures as
-    successes are marked, and the caption says which metric to trust.
+    The interval is the bootstrap interval of the interquartile mean (IQM) of the runs, or of the mean of one run's episodes.
+    Final infos that count failures as successes are marked, and the caption says which metric to trust.
     """
     options = "".join(f", {name}={value}" for name, value in experiment.options.items())
     first, _ = metric(experiment.env)
@@ -176,12 +176,14 @@ def table(experiment: Experiment) -> Table:
         f"Trust {first}. * as the original reports it: a last command that failed counts as executed, so that an agent "
         "that fails can reach 1.0."
     )
-    columns = {name: name != "metric" for name in ("steps", "metric", "mean", "std", "IQM", "95 % of IQM")}
+    interval_of = ("95 % of mean",) if len(experiment.runs) == 1 else ("IQM", "95 % of IQM")
+    columns = {name: name != "metric" for name in ("steps", "metric", "mean", "std", *interval_of)}
     result = tables.table(title, columns, caption if doubtful else "")
     for name, step, summary, _ in rows:
         name = f"{name} *" if name in doubtful else name
         interval = f"{summary.low:.4f} {summary.high:.4f}"
-        result.add_row(f"{step:,}", name, f"{summary.mean:.4f}", f"{summary.std:.4f}", f"{summary.iqm:.4f}", interval)
+        iqm = [] if summary.iqm is None else [f"{summary.iqm:.4f}"]
+        result.add_row(f"{step:,}", name, f"{summary.mean:.4f}", f"{summary.std:.4f}", *iqm, interval)
     return result
 
 

@@ -14,7 +14,7 @@ from endless_gym.specs import Metric, spec
 from endless_gym_agents.common import regular
 from endless_gym_agents.evaluation.statistics import Summary, summarise
 from endless_gym_agents.memories import MEMORIES
-from endless_gym_agents.settings import Recurrence, Settings
+from endless_gym_agents.settings import ONE_HOT, VECTORS, Recurrence, Settings
 
 
 def metric(env: str) -> Metric:
@@ -91,7 +91,7 @@ class Experiment:
             return [(step, summarise(column), over) for step, column in zip(self.common_steps(), columns, strict=True)]
         (run,) = self.runs
         return [
-            (step, summarise([episode[metric] for episode in episodes]), f"{len(episodes)} episodes")
+            (step, summarise([episode[metric] for episode in episodes], of_runs=False), f"{len(episodes)} episodes")
             for step, episodes in zip(run.steps, run.episodes, strict=True)
         ]
 
@@ -107,7 +107,9 @@ def label(settings: Settings) -> str:
     if settings.agent in ("gru", "lstm", *MEMORIES) and settings.recurrence.hidden_size != Recurrence().hidden_size:
         name += f"_{settings.recurrence.hidden_size}"
     encoder = (settings.encoder.rpartition(":")[2], *settings.encoder_option) if settings.encoder else ()
-    wrappers = (wrapper.rpartition(":")[2] for wrapper in settings.environment.wrapper)
+    # Those that an environment has by default say nothing about the agent.
+    own = (wrapper for wrapper in settings.environment.wrapper if wrapper not in (VECTORS, ONE_HOT))
+    wrappers = (wrapper.rpartition(":")[2] for wrapper in own)
     name += "".join(f"_{part}" for part in (*encoder, *wrappers))
     additions = {
         "_gt": settings.ppo.ground_truth_coefficient,

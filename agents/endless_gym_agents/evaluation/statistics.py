@@ -35,6 +35,12 @@ def _interquartile_means(samples: Scores) -> Scores:
     return means
 
 
+def _means(samples: Scores) -> Scores:
+    """The mean of each row: (samples, scores) to (samples,)."""
+    means: Scores = samples.mean(axis=1)
+    return means
+
+
 def stratified_bootstrap(
     scores: ArrayLike,
     estimate: Callable[[Scores], Scores] = _interquartile_means,
@@ -74,20 +80,20 @@ class Summary:
     Attributes:
         mean: Mean.
         std: Population standard deviation of all scores, as in the paper's plots.
-        iqm: Interquartile mean.
-        low: Lower end of the 95 % bootstrap interval of the interquartile mean.
+        iqm: Interquartile mean of runs; `None` for the episodes of one run, of which it would hide the rare ones.
+        low: Lower end of the 95 % bootstrap interval of the interquartile mean, or, of episodes, of the mean.
         high: Upper end of that interval.
     """
 
     mean: float
     std: float
-    iqm: float
+    iqm: float | None
     low: float
     high: float
 
 
-def summarise(scores: ArrayLike) -> Summary:
-    """Compute all estimates of scores (runs, tasks) or (runs,).
+def summarise(scores: ArrayLike, of_runs: bool = True) -> Summary:
+    """Compute all estimates of scores (runs, tasks) or (runs,), or of the episodes of one run.
 
     Raises:
         ValueError: There are no scores.
@@ -95,5 +101,6 @@ def summarise(scores: ArrayLike) -> Summary:
     table = np.asarray(scores, dtype=np.float64)
     if not table.size:
         raise ValueError("scores must contain at least one number, got none")
-    low, high = stratified_bootstrap(table)
-    return Summary(float(table.mean()), float(table.std()), interquartile_mean(table), low, high)
+    low, high = stratified_bootstrap(table, _interquartile_means if of_runs else _means)
+    iqm = interquartile_mean(table) if of_runs else None
+    return Summary(float(table.mean()), float(table.std()), iqm, low, high)

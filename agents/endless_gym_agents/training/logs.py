@@ -61,6 +61,7 @@ class Logger:
             raise MissingRow(
                 f"{run / PROGRESS} has no row of update {len(ends)}, and the checkpoint is of update {update}; {_help(run)}"
             )
+        self._at_most = "at most " if settings.stop_when_learnt or settings.target_reward is not None else ""
         self._progress = (run / PROGRESS).open("ab")
         self._progress.truncate(ends[update])
         # The axis is environment steps, in which runs of different settings can be compared.
@@ -100,7 +101,7 @@ class Logger:
         )
         self.console.print(
             f"[bold]{update:>5}[/]/{self._updates} {steps:>11,} steps {metrics['steps_per_second']:>8,.0f}/s "
-            f"{duration(left):>12} left  "
+            f"{self._at_most}{duration(left):>12} left  "
             f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]",
             markup=True,
         )

@@ -220,7 +220,9 @@ def train_rank(
                 save(settings.keep_checkpoints and is_planned)
         if success is not None:
             logger.print(f"the task is learnt: {success}; train longer with --no-stop-when-learnt")
-        logger.print(f"{update} of {ppo.updates} updates done; continue with: endless-train --resume {run}")
+        more = f" --ppo.updates {2 * update}" if update >= ppo.updates else ""
+        verb = "train longer" if more else "continue"
+        logger.print(f"{update} of {ppo.updates} updates done; {verb} with: endless-train --resume {run}{more}")
         logger.close()
         failures = [failure for failure in ranks.everywhere(environments.failure) if failure is not None]
         if failures:
