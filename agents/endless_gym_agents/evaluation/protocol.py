@@ -159,8 +159,8 @@ def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] 
 def table(experiment: Experiment) -> Table:
     """A table with all metrics of the last checkpoint, and the paper's metric for the earlier ones.
 
-    The interval is the bootstrap interval of the interquartile mean (IQM) of the runs, or of the mean of one run's episodes.
-    Final infos that count failures as successes are marked, and the caption says which metric to trust.
+    The interval is the bootstrap interval of the interquartile mean (IQM) of the runs, or of the mean of a run's episodes. Final
+    infos that count failures as successes are marked, and the caption says which metric to trust.
     """
     options = "".join(f", {name}={value}" for name, value in experiment.options.items())
     first, _ = metric(experiment.env)

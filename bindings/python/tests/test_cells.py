@@ -9,6 +9,7 @@ import contextlib
 import json
 import pickle
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from support import same
 
 import endless_gym
 from endless_gym.popgym import PreviousAction
+from endless_gym.program import program
 
 #: An environment of each suite and of each kind of observation and action space.
 IDS = [
@@ -188,3 +190,23 @@ def test_environments_have_pictures_or_text(id: str, where: str) -> None:
         else:
             assert re.fullmatch(r"\S+ \S+(  \S+ \S+)*", shown)
             assert ("spades" in shown or "hearts" in shown) or "Repeat" not in id
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("list EndlessGym/MysteryPath-v0", ""),
+        ("list mystery", "endless: no environment `mystery`; did you mean MysteryPath-v0? `endless list` shows all\n"),
+        ("list RepeatFirstEasy", "did you mean popgym-RepeatFirstEasy-v0?"),
+        ("list xyz", "no environment `xyz`; there are MortarMayhem-v0, "),
+        ("page", "the page shows the environments of a crate, and there is none in "),
+    ],
+)
+def test_the_program_says_what_to_do(arguments: str, message: str, tmp_path: Path) -> None:
+    ran = subprocess.run([*program(), *arguments.split()], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert message in ran.stderr and bool(ran.stderr) == bool(message) == bool(ran.returncode)
+
+
+def test_a_text_is_no_list_of_seeds() -> None:
+    with pytest.raises(TypeError, match="seed must be an integer, got 'a'"):
+        endless_gym.make_vec("MysteryPath-Grid-v0", 4).reset(seed="a")

@@ -167,6 +167,10 @@ pub fn learn(
         print(reason);
     }
     let (updates, run) = (settings.ppo.updates, run.display());
-    print(format_args!("{update} of {updates} updates done; continue with: endless learn --resume {run}"));
+    let (verb, more) = match update < updates {
+        true => ("continue", String::new()),
+        false => ("train longer", format!(" --ppo.updates {}", 2 * update)),
+    };
+    print(format_args!("{update} of {updates} updates done; {verb} with: endless learn --resume {run}{more}"));
     Ok(folder.path.clone())
 }

@@ -62,4 +62,6 @@ class ResetRequests:
 
 def _has_items(seed: Seeds) -> TypeGuard[Sequence[int | None]]:
     """Whether there is a seed for each environment, instead of one for all."""
-    return isinstance(seed, Sequence) or (isinstance(seed, np.ndarray) and seed.ndim > 0)
+    return (isinstance(seed, Sequence) and not isinstance(seed, (str, bytes))) or (
+        isinstance(seed, np.ndarray) and seed.ndim > 0
+    )

@@ -379,7 +379,9 @@ fn original(args: &Args, spec: &EnvSpec) -> Result<f64, Failure> {
         .map_err(|error| format!("cannot run {python}: {error}"))?;
     let failed = || {
         let message = String::from_utf8_lossy(&output.stderr);
-        format!("{python} cannot measure the original: {}", message.trim().lines().last().unwrap_or("no message"))
+        let version = if message.contains("SyntaxError") { "; it must be a Python 3" } else { "" };
+        let last = message.trim().lines().last().unwrap_or("no message");
+        format!("{python} cannot measure the original: {last}{version}")
     };
     let printed = String::from_utf8_lossy(&output.stdout);
     // The original's libraries print other lines first.

@@ -57,6 +57,15 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
 
 /// Builds the library of the crate for WebAssembly, and returns its path.
 fn build(manifest: Option<PathBuf>) -> Result<PathBuf, Failure> {
+    let here = std::env::current_dir().unwrap_or_default();
+    if manifest.is_none() && !here.ancestors().any(|folder| folder.join("Cargo.toml").exists()) {
+        let advice = "run it in the folder of one, or with --manifest-path FILE; `endless new NAME` makes one";
+        return Err(format!(
+            "the page shows the environments of a crate, and there is none in {}: {advice}",
+            here.display()
+        )
+        .into());
+    }
     let mut cargo = Command::new(var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     cargo.args(["build", "--release", "--lib", "--target", TARGET, "--message-format=json-render-diagnostics"]);
     cargo.args(manifest.iter().flat_map(|path| ["--manifest-path".as_ref(), path.as_os_str()]));

@@ -76,7 +76,7 @@ struct EngineArgs {
     #[arg(long, default_value_t = 1)]
     groups: usize,
     /// Name of the engine, by which trainers find it: 1 to 64 letters, digits, `.`, `_` or `-`.
-    #[arg(long, value_name = "NAME", default_value = "endless")]
+    #[arg(long, value_name = "NAME", default_value = "endless", alias = "name")]
     service: String,
     #[command(flatten)]
     environment: EnvironmentArgs,

@@ -49,7 +49,7 @@ impl Controls {
             || self.has_directions() && !(0..self.chosen.len()).any(waits)
     }
 
-    fn has_directions(&self) -> bool {
+    pub fn has_directions(&self) -> bool {
         let branches = self.spec.action_space.branches().iter().enumerate();
         branches
             .flat_map(|(branch, choices)| (0..*choices as usize).map(move |choice| (branch, choice)))
@@ -95,7 +95,12 @@ impl Controls {
         }
         self.chosen[at] = number;
         self.is_typing = *choices > DIGITS;
-        !self.is_timed() && self.chosen.len() == 1 && *choices <= DIGITS
+        self.plays_digits()
+    }
+
+    /// Whether a digit is an action.
+    fn plays_digits(&self) -> bool {
+        !self.is_timed() && matches!(self.spec.action_space.branches(), [choices] if *choices <= DIGITS)
     }
 
     /// Selects the next number.
@@ -155,13 +160,14 @@ impl Controls {
             parts.push("arrows change the number in brackets".to_owned());
         }
         let branches = self.spec.action_space.branches();
+        let verb = if self.plays_digits() { "play" } else { "choose" };
         match self.free.get(self.selected).map(|at| (*at, branches.get(*at).copied())) {
             Some((at, Some(choices))) if choices <= DIGITS => {
                 let names = (0..choices as usize).map(|choice| match choice_name(&self.spec, at, choice) {
                     name if name == choice.to_string() => name,
                     name => format!("{choice} {name}"),
                 });
-                parts.push(format!("digits choose {}", names.collect::<Vec<_>>().join(" ")));
+                parts.push(format!("digits {verb} {}", names.collect::<Vec<_>>().join(" ")));
             }
             Some((_, Some(choices))) => parts.push(format!("digits choose 0 to {}", choices - 1)),
             Some((_, None)) => parts.push("0 resets it".to_owned()),
@@ -173,9 +179,12 @@ impl Controls {
         if self.is_timed() {
             parts.push("Space pauses, N one step".to_owned());
         } else if !self.free.is_empty() {
-            parts.push("Enter plays".to_owned());
+            parts.push(
+                if self.plays_digits() { "Enter plays the number in brackets" } else { "Enter plays" }.to_owned(),
+            );
         }
-        parts.push("R restarts, PgUp/PgDn seed, Esc quits".to_owned());
+        let quit = if self.has_directions() { "Esc" } else { "Q or Esc" };
+        parts.push(format!("R restarts, PgUp/PgDn seed, {quit} quits"));
         parts.join(", ")
     }
 }
@@ -233,7 +242,8 @@ mod tests {
     fn a_digit_plays_one_of_few_choices_and_several_digits_name_one_of_many() {
         let mut few = controls(ActionSpace::Discrete(3), &[]);
         assert!(!few.is_timed() && few.can_play_chosen());
-        assert!(few.digit(2));
+        assert!(few.digit(2) && few.help().contains("digits play 0 1 2, Enter plays the number in brackets"));
+        assert!(few.help().ends_with("Q or Esc quits"));
         assert_eq!(few.action(&[]), [2]);
         assert!(!few.digit(3), "there are three choices");
         assert_eq!(few.action(&[]), [2]);

@@ -10,7 +10,7 @@ use ratatui::layout::Rect;
 
 use super::controls::Controls;
 use super::game::Game;
-use super::keys::{self, Command, Keys};
+use super::keys::{self, Command, Direction, Keys};
 use super::picture::fitting;
 use super::screen::{Screen, check};
 use super::status;
@@ -84,6 +84,10 @@ pub fn run(registry: &Registry, id: &str, options: OptionMap, seed: u64, args: &
             match screen.event(wait)? {
                 Some(Event::Key(event)) => match keys::command(event) {
                     Some(Command::Quit) => return Ok(()),
+                    // The key Q where there is nothing to move.
+                    Some(Command::Move([Direction::Left, Direction::Up])) if !player.controls.has_directions() => {
+                        return Ok(());
+                    }
                     Some(command) => player.carry_out(command)?,
                     None => continue,
                 },
@@ -227,7 +231,6 @@ mod tests {
 
     use endless_gym_memory_gym::memory_gym;
 
-    use super::super::keys::Direction;
     use super::*;
 
     fn player(id: &str) -> Player {

@@ -253,10 +253,23 @@ impl EnvSpec {
 
 /// The registry does not have this id.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("no environment `{id}`; there are {known}")]
+#[error("no environment `{id}`; {}", self.hint())]
 pub struct UnknownEnvironment {
     /// The given id.
     pub id: String,
     /// All known ids, separated by commas.
     pub known: String,
+}
+
+impl UnknownEnvironment {
+    /// The known id that is most like the given one, or all of them.
+    fn hint(&self) -> String {
+        let likeness = |known: &str| strsim::jaro_winkler(&known.to_lowercase(), &self.id.to_lowercase());
+        let likely =
+            self.known.split(", ").map(|known| (known, likeness(known))).filter(|(_, likeness)| *likeness > 0.7);
+        match likely.max_by(|(_, one), (_, other)| one.total_cmp(other)) {
+            Some((known, _)) => format!("did you mean {known}? `endless list` shows all"),
+            None => format!("there are {}", self.known),
+        }
+    }
 }

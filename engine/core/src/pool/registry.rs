@@ -93,7 +93,9 @@ impl Registry {
         expert.ok_or_else(|| NoExpert { id: id.to_owned() })
     }
 
+    /// As in Python, an id may have the prefix `EndlessGym/`.
     pub(super) fn entry(&self, id: &str) -> Result<&Arc<Entry>, UnknownEnvironment> {
+        let id = id.strip_prefix("EndlessGym/").unwrap_or(id);
         self.entries.iter().find(|entry| entry.spec.id == id).ok_or_else(|| UnknownEnvironment {
             id: id.to_owned(),
             known: self.specs().map(|spec| spec.id).collect::<Vec<_>>().join(", "),
