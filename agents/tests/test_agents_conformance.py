@@ -147,6 +147,7 @@ def test_the_program_prints_the_checks_and_fails_if_one_fails(
         assert conformance.main() == status
         printed = capsys.readouterr()
         assert ("FAILED  agreement" in printed.out) == bool(status)
+        assert "the last check plays 200 steps and is the longest: about " in printed.err
     assert "own.py:Rounds fails agreement" in printed.err
 
 

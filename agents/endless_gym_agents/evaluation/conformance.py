@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +32,7 @@ from torch import Tensor
 
 from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common import command
+from endless_gym_agents.common.clock import duration
 from endless_gym_agents.common.ranges import Positive
 from endless_gym_agents.memories.memory import AnyMemory, MemoryState
 from endless_gym_agents.memories.recurrent import RecurrentMemory, RecurrentState
@@ -276,11 +278,17 @@ def execute(given: ConformanceArguments) -> None:
     Raises:
         ValueError: There is no such memory, or a check has failed.
     """
-    failed = []
+    failed, start, is_first = [], time.monotonic(), True
     for result in check(given.agent, given.agent_option, given.steps, given.long_steps, given.device):
         verdict = "passed" if result.passed else "FAILED"
         print(f"{verdict}  {result.name:<10} {result.measured:<10.3g} {result.allowed}", flush=True)
         failed += [] if result.passed else [result.name]
+        if is_first:
+            # With gradients, a step takes about twice as long.
+            left = 2 * (time.monotonic() - start) * given.long_steps / given.steps
+            message = f"the last check plays {given.long_steps:,} steps and is the longest: about {duration(left)}"
+            print(message, file=sys.stderr, flush=True)
+            is_first = False
     if failed:
         raise ValueError(
             f"{given.agent} fails {', '.join(failed)}; the documentation of the module describes the checks"
