@@ -77,8 +77,12 @@ enum Task {
         #[arg(long, default_value_t = 1)]
         minutes: u64,
     },
-    /// Set up the original in a virtual environment and print the path of its Python.
-    Original,
+    /// Set up an original in a virtual environment and print the path of its Python.
+    Original {
+        /// POPGym, in place of Memory Gym.
+        #[arg(long)]
+        popgym: bool,
+    },
 }
 
 /// Arguments of the program that a task runs; `--help` lists them.
@@ -103,7 +107,9 @@ fn main() -> ExitCode {
         Task::Soak(Arguments { arguments }) => rust::faults("soak", &arguments),
         Task::Live { steps } => rust::test_original(Some(steps)),
         Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), minutes),
-        Task::Original => python::original().map(|python| println!("{}", python.display())),
+        Task::Original { popgym } => {
+            [python::original, python::popgym][usize::from(popgym)]().map(|python| println!("{}", python.display()))
+        }
     };
     let Err(message) = result else { return ExitCode::SUCCESS };
     eprintln!("xtask: {message}");
