@@ -192,7 +192,7 @@ fn a_failed_recording_is_an_error_and_leaves_no_file() {
     };
     for (arguments, status, message) in [
         (&["MysteryPath-v0", "--film", "a.GIF"][..], 1, "a film's name must end in .webp or .mp4, got `a.GIF`"),
-        (&["MysteryPath-v1", "--film", "a.webp"], 1, "no environment `MysteryPath-v1`; there are"),
+        (&["MysteryPath-v1", "--film", "a.webp"], 1, "no environment `MysteryPath-v1`; did you mean MysteryPath-v0?"),
         (&["MysteryPath-v0", "--film", "no/a.webp"], 1, "cannot write no/a.webp: "),
         (&["MysteryPath-v0", "--film", "a.webp", "--option", "x"], 1, "--option x: expected NAME=VALUE"),
         (&["MortarMayhem-v0", "--film=a.webp", "--option", "arena_size=9"], 1, "arena_size"),

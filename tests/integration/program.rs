@@ -29,7 +29,9 @@ fn list_shows_environments_and_parameters() {
     assert_eq!(json[0]["parameters"][2]["max"], 6);
     let unknown = place.run(&["list", "MortarMayhem-v1"]);
     assert_eq!(unknown.status.code(), Some(1));
-    assert!(text(&unknown.stderr).starts_with("endless: no environment `MortarMayhem-v1`; there are MortarMayhem-v0"));
+    assert!(
+        text(&unknown.stderr).starts_with("endless: no environment `MortarMayhem-v1`; did you mean MortarMayhem-v0?")
+    );
     assert_eq!(text(&unknown.stderr).lines().count(), 1);
 }
 
