@@ -24,7 +24,9 @@ class PopgymEnv(Env, POPGymEnv):
     @property
     def state_space(self) -> gymnasium.Space[Any]:
         """Not available."""
-        raise NotImplementedError(f"{self._spec.id} has no hidden state here; observe `popgym` itself for it")
+        raise NotImplementedError(
+            f"{self._spec.id} has no hidden state here; the environment of the package popgym has it"
+        )
 
     def get_state(self) -> Any:
         """Not available."""
