@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
@@ -539,8 +539,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._options.started(group, envs, given, text)
 
 
-def check_adaptable(envs: EndlessVectorEnv, autoreset: AutoresetMode, library: str) -> None:
-    """Check that a library can use vector environments.
+def check_adaptable(envs: EndlessVectorEnv | VectorWrapper, autoreset: AutoresetMode, library: str) -> EndlessVectorEnv:
+    """Check that a library can use vector environments, and return them without their wrappers.
 
     Args:
         envs: The vector environments.
@@ -548,10 +548,20 @@ def check_adaptable(envs: EndlessVectorEnv, autoreset: AutoresetMode, library: s
         library: Its name, for messages.
 
     Raises:
-        ValueError: The environments have another auto-reset mode, or more than one group.
+        TypeError: They are not `EndlessVectorEnv`s.
+        ValueError: The environments have another auto-reset mode, more than one group, or tuples as observations.
     """
+    own = envs.unwrapped
+    if not isinstance(own, EndlessVectorEnv):
+        raise TypeError(f"envs must be made by make_vec, serve or connect, got {envs!r}")
     mode = AutoresetMode(envs.metadata["autoreset_mode"])
     if mode is not autoreset:
         raise ValueError(f'autoreset must be "{autoreset.name.lower()}" for {library}, got "{mode.name.lower()}"')
-    if envs.num_groups != 1:
-        raise ValueError(f"groups must be 1 for {library}, got {envs.num_groups}")
+    if own.num_groups != 1:
+        raise ValueError(f"groups must be 1 for {library}, got {own.num_groups}")
+    if isinstance(envs.single_observation_space, gymnasium.spaces.Tuple):
+        raise ValueError(
+            f"observations must not be tuples for {library}, got {envs.single_observation_space}; flatten them with "
+            "endless_gym.popgym.PreviousAction(envs, flatten=True)"
+        )
+    return own
