@@ -107,9 +107,7 @@ fn main() -> ExitCode {
         Task::Soak(Arguments { arguments }) => rust::faults("soak", &arguments),
         Task::Live { steps } => rust::test_original(Some(steps)),
         Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), minutes),
-        Task::Original { popgym } => {
-            [python::original, python::popgym][usize::from(popgym)]().map(|python| println!("{}", python.display()))
-        }
+        Task::Original { popgym } => python::original(popgym).map(|python| println!("{}", python.display())),
     };
     let Err(message) = result else { return ExitCode::SUCCESS };
     eprintln!("xtask: {message}");

@@ -118,18 +118,14 @@ fn install_with_agents(environment: &Path) -> Result<(), String> {
     run(pip_install(environment)?.args(["--reinstall", "--no-deps"]).arg(workspace().join("agents")))
 }
 
-/// The path of the Python that has the original.
-pub fn original() -> Result<PathBuf, String> {
+/// The path of the Python that has an original: Memory Gym, or POPGym.
+pub fn original(popgym: bool) -> Result<PathBuf, String> {
     // Pinned, so that every comparison uses the same original.
-    reference("original", &["memory-gym==1.0.2", "numpy==1.26.4"])
-}
-
-/// The path of the Python that has POPGym.
-pub fn popgym() -> Result<PathBuf, String> {
-    reference("popgym", &["popgym==1.0.7", "gymnasium==1.4.0", "mazelib==0.9.16", "cython==3.3.1", "numpy==2.4.6"])
-}
-
-fn reference(name: &str, packages: &[&str]) -> Result<PathBuf, String> {
+    let (name, packages) = if popgym {
+        ("popgym", &["popgym==1.0.7", "gymnasium==1.4.0", "mazelib==0.9.16", "cython==3.3.1", "numpy==2.4.6"][..])
+    } else {
+        ("original", &["memory-gym==1.0.2", "numpy==1.26.4"][..])
+    };
     let base = interpreter(ORIGINAL).ok_or("CPython 3.11 is missing, which the originals require")?;
     Ok(tools(name, &base, packages)?.join("bin/python"))
 }
@@ -207,7 +203,7 @@ pub fn test_agents() -> Result<(), String> {
 pub fn test_original() -> Result<(), String> {
     let environment = environment()?;
     install(&environment)?;
-    pytest(&environment, "bindings/python", "original", &[("ENDLESS_ORIGINAL_PYTHON", original()?)])
+    pytest(&environment, "bindings/python", "original", &[("ENDLESS_ORIGINAL_PYTHON", original(false)?)])
 }
 
 fn mypy(environment: &Path, package: &str) -> Result<(), String> {
@@ -231,7 +227,7 @@ pub fn bench(arguments: &[String]) -> Result<(), String> {
     let environment = environment()?;
     install(&environment)?;
     let mut script = Command::new(environment.join("bin/python"));
-    script.arg(workspace().join("benches/comparison.py")).arg("--original").arg(original()?);
+    script.arg(workspace().join("benches/comparison.py")).arg("--original").arg(original(false)?);
     run(script.args(arguments))
 }
 

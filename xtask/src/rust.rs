@@ -68,7 +68,9 @@ pub fn test_original(steps: Option<u64>) -> Result<(), String> {
         Some(steps) => cargo.arg("--release").env("ENDLESS_LIVE_STEPS", steps.to_string()),
         None => cargo.env("PROPTEST_RNG_SEED", PROPERTY_SEED),
     };
-    cargo.env("ENDLESS_POPGYM_PYTHON", python::popgym()?).env("ENDLESS_ORIGINAL_PYTHON", python::original()?);
+    cargo
+        .env("ENDLESS_POPGYM_PYTHON", python::original(true)?)
+        .env("ENDLESS_ORIGINAL_PYTHON", python::original(false)?);
     run(cargo.args(["--", "--ignored", "--nocapture", "live::"]))
 }
 
