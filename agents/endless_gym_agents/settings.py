@@ -22,8 +22,9 @@ from endless_gym_agents.common import own, ranges
 from endless_gym_agents.common.own import MEMORIES
 from endless_gym_agents.common.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
 
-#: The agents of the package. Others are classes of your own; see `Settings.agent`.
+#: The agents without a memory.
 BASELINES = ("none", "stack", "position")
+#: The agents of the package. Others are classes of your own; see `Settings.agent`.
 AGENTS = ("gru", "lstm", *MEMORIES, "trxl", "gtrxl", *BASELINES)
 PresetName = Literal["paper", "old", "overnight", "throughput", "throughput-512", "quick"]
 

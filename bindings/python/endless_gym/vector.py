@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
@@ -20,7 +20,7 @@ from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.display.descriptions import documented, metadata
 from endless_gym.display.rendering import TEXT_MODES, VECTOR_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.interop import PageLocks
-from endless_gym.requests.configuration import Options
+from endless_gym.requests.configuration import AutoresetMode, Options
 from endless_gym.requests.exceptions import TooManyBatchesHeld
 from endless_gym.requests.next_options import NextOptions, RunningEpisode, running_episodes
 from endless_gym.requests.reset_requests import ResetRequests, Seeds
@@ -539,7 +539,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._options.started(group, envs, given, text)
 
 
-def check_adaptable(envs: EndlessVectorEnv | VectorWrapper, autoreset: AutoresetMode, library: str) -> EndlessVectorEnv:
+def check_adaptable(
+    envs: EndlessVectorEnv | gymnasium.vector.VectorWrapper, autoreset: AutoresetMode, library: str
+) -> EndlessVectorEnv:
     """Check that a library can use vector environments, and return them without their wrappers.
 
     Args:
