@@ -213,8 +213,6 @@ def test_smallest_version_of_each_kind_of_experiment_runs(name: str, tmp_path: P
     given = json.loads((Path(definitions.__file__).parent / f"{name}.json").read_text())
     run = given["runs"][-1]
     given |= {"runs": [run], "aggregate": ""}
-    # Compilation takes minutes, and is tested with the agents.
-    run.get("flags", {}).pop("compile", None)
     file.write_text(json.dumps(given))
     execute(ReproduceArguments((str(file),), scale="tiny", out=tmp_path / "out", device="cpu", nice=0))
     page = (tmp_path / "out" / "scale-2e-05" / name / "README.md").read_text()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, reduce
 from itertools import pairwise
 from typing import Any
 
@@ -105,7 +105,7 @@ class KernelGRU(torch.autograd.Function):
             return inputs, grad_weight, bias, hidden
 
         inputs, weights, biases, hidden = _each(compute, ctx.shares, saved)
-        return _joined(inputs), sum(weights), sum(biases), _joined(hidden, 0), None
+        return _joined(inputs), reduce(torch.add, weights), reduce(torch.add, biases), _joined(hidden, 0), None
 
 
 class KernelLSTM(torch.autograd.Function):
@@ -156,7 +156,7 @@ class KernelLSTM(torch.autograd.Function):
             return inputs, grad_weight, hidden, cell
 
         inputs, weights, hidden, cell = _each(compute, ctx.shares, saved)
-        return _joined(inputs), sum(weights), _joined(hidden, 0), _joined(cell, 0), None
+        return _joined(inputs), reduce(torch.add, weights), _joined(hidden, 0), _joined(cell, 0), None
 
 
 class KernelMinGRU(torch.autograd.Function):

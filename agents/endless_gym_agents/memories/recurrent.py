@@ -194,9 +194,9 @@ def _layers(kind: type[nn.Module], inputs: int, settings: Recurrence, options: d
             f"SequenceModel; {kind.__name__} determines them itself, by --agent-option"
         )
     try:
-        if is_cell:
-            return Cell(kind(inputs, settings.hidden_size, **options), settings.hidden_size)
-        return Stack(kind, inputs, settings.hidden_size, settings.layers, options)
+        if issubclass(kind, SequenceModel):
+            return Stack(kind, inputs, settings.hidden_size, settings.layers, options)
+        return Cell(kind(inputs, settings.hidden_size, **options), settings.hidden_size)
     except TypeError as error:
         raise ValueError(
             f"{kind.__name__} cannot be made of an input width, a hidden size and --agent-option: {error}"
