@@ -21,7 +21,7 @@ from torch.autograd.function import once_differentiable
 
 from endless_gym import _native
 
-#: Fewest sequences for a thread; with fewer, the products have too few rows.
+#: Fewest sequences for a thread, so that the products have several rows.
 SEQUENCES_PER_THREAD = 4
 
 

@@ -187,8 +187,7 @@ class RecurrentMemory(Memory[RecurrentState, State, RecurrentMinibatch]):
 
 def _layers(kind: type[nn.Module], inputs: int, settings: Recurrence, options: dict[str, Any]) -> SequenceModel:
     """The layers of a class; see `RecurrentMemory`."""
-    is_cell = not issubclass(kind, SequenceModel)
-    if settings.residual or (is_cell and settings.layers != 1):
+    if settings.residual or (settings.layers != 1 and not issubclass(kind, SequenceModel)):
         raise ValueError(
             "--recurrence.residual is for the agents gru and lstm, and --recurrence.layers for these and classes derived from "
             f"SequenceModel; {kind.__name__} determines them itself, by --agent-option"
