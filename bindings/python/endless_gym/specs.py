@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -288,7 +287,7 @@ def spec(id: str) -> Spec:
 
     Raises:
         TypeError: The id is not a string.
-        ValueError: The module cannot be imported, or there is no such id; the message lists all ids.
+        ValueError: The module cannot be imported, or there is no such id; the message has the likely ids, or all.
     """
     if not isinstance(id, str):
         raise TypeError(f"id must be a string, got {id!r}")
@@ -300,10 +299,9 @@ def spec(id: str) -> Spec:
         raise ValueError(f"id must name a module that can be imported, got {id!r}: {error}") from error
     name = name.removeprefix("EndlessGym/")
     if name not in _SPECS:
-        by_lower = {each.lower(): each for each in _SPECS}
-        near = difflib.get_close_matches(name.lower(), by_lower, 1)
-        hint = f"; did you mean {by_lower[near[0]]}?" if near else ""
-        raise ValueError(f"id must be one of {', '.join(_SPECS)}, got {id!r}{hint}")
+        if likely := _native.likely_ids(name, list(_SPECS)):
+            raise ValueError(f"id must be one of endless_gym.all_specs(), got {id!r}; did you mean {likely}?")
+        raise ValueError(f"id must be one of {', '.join(_SPECS)}, got {id!r}")
     return _SPECS[name]
 
 

@@ -31,6 +31,8 @@ use std::ffi::OsString;
 use std::sync::OnceLock;
 
 use endless_gym::DEFAULT_ENV_ID;
+#[cfg(feature = "native")]
+use endless_gym::envs::UnknownEnvironment;
 use endless_gym::pool::{Autoreset, Registry, RegistryError};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -52,6 +54,13 @@ fn specs() -> PyResult<String> {
     serde_json::to_string(&specs).map_err(|error| PyRuntimeError::new_err(error.to_string()))
 }
 
+/// The ids of `known` that an unknown one may stand for, such as `A-v0 or B-v0`; `None` if there are none.
+#[cfg(feature = "native")]
+#[pyfunction]
+fn likely_ids(id: String, known: Vec<String>) -> Option<String> {
+    UnknownEnvironment { id, known: known.join(", ") }.likely()
+}
+
 /// The maximum number of steps of an episode with reset parameters, an object of JSON; -1 without a limit, or if this module does not
 /// have the id.
 #[pyfunction]
@@ -71,6 +80,7 @@ fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) 
 #[pymodule(name = "_native")]
 fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(films::write_film, module)?)?;
+    module.add_function(wrap_pyfunction!(likely_ids, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::gru_forward, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::gru_backward, module)?)?;
     module.add_function(wrap_pyfunction!(kernels::lstm_forward, module)?)?;

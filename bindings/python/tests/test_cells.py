@@ -197,7 +197,15 @@ def test_environments_have_pictures_or_text(id: str, where: str) -> None:
     ("arguments", "message"),
     [
         ("list EndlessGym/MysteryPath-v0", ""),
-        ("list mystery", "endless: no environment `mystery`; did you mean MysteryPath-v0? `endless list` shows all\n"),
+        (
+            "list mysterypath",
+            "endless: no environment `mysterypath`; did you mean MysteryPath-v0? `endless list` shows all\n",
+        ),
+        (
+            "list popgym-RepeatPrevious",
+            "did you mean popgym-RepeatPreviousEasy-v0, popgym-RepeatPreviousMedium-v0 or popgym-",
+        ),
+        ("list popgym", "did you mean one of 48 such ids? `endless list` shows all"),
         ("list RepeatFirstEasy", "did you mean popgym-RepeatFirstEasy-v0?"),
         ("list xyz", "no environment `xyz`; there are MortarMayhem-v0, "),
         ("page", "the page shows the environments of a crate, and there is none in "),

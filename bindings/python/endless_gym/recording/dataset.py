@@ -44,14 +44,22 @@ def check_id(dataset: str) -> str:
     """The id of a data set, as Minari writes it.
 
     Raises:
-        ValueError: It is not of the form `(namespace/)name-v(version)`.
+        ValueError: It is not of the form `(namespace/)name-v(version)`; the message says where it differs.
     """
-    found = DATASET_ID_RE.fullmatch(dataset) if isinstance(dataset, str) else None
-    if found is None or found["version"] is None or re.search("//|^/|/$", dataset):
-        raise ValueError(
-            f"dataset must be of the form (namespace/)name-v(version), such as mine/mystery-path-v0, got {dataset!r}"
-        )
-    return dataset
+    if not isinstance(dataset, str):
+        reason = "it must be a string"
+    elif wrong := re.search(r"[^-_\w/]", dataset):
+        reason = f"it may have letters, digits, `-`, `_` and `/`, not {wrong[0]!r}"
+    elif re.search("//|^/|/$", dataset):
+        reason = "between its `/` must be names"
+    elif not re.search(r"-v\d+$", dataset):
+        reason = f"its version is missing: {dataset}-v0"
+    elif not (found := DATASET_ID_RE.fullmatch(dataset)) or found["version"] is None:
+        reason = "its name must not be empty, nor its namespace shorter than 2 characters"
+    else:
+        return dataset
+    form = "(namespace/)name-v(version), such as mine/mystery-path-v0"
+    raise ValueError(f"dataset must be of the form {form}, got {dataset!r}: {reason}")
 
 
 class DatasetWriter:

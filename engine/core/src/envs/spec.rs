@@ -262,14 +262,59 @@ pub struct UnknownEnvironment {
 }
 
 impl UnknownEnvironment {
-    /// The known id that is most like the given one, or all of them.
+    /// The known ids that the given one may stand for, such as `A-v0 or B-v0`: the one of which it is the name without a version,
+    /// those that contain it, or the one most like it.
+    pub fn likely(&self) -> Option<String> {
+        const MOST: usize = 6;
+        let given = self.id.to_lowercase();
+        let known = || self.known.split(", ").map(|known| (known, known.to_lowercase()));
+        let is_version = |rest: &str| rest.strip_prefix("-v").is_some_and(|rest| rest.parse::<u32>().is_ok());
+        let is_named = |lower: &str| lower.strip_prefix(&given).is_some_and(is_version);
+        let mut ids: Vec<_> = known().filter(|(_, lower)| is_named(lower)).collect();
+        if ids.is_empty() {
+            ids = known().filter(|(_, lower)| lower.contains(&given)).collect();
+        }
+        if ids.is_empty() {
+            let like = known().map(|one| (strsim::jaro_winkler(&one.1, &given), one));
+            ids.extend(
+                like.filter(|(like, _)| *like > 0.7).max_by(|(a, _), (b, _)| a.total_cmp(b)).map(|(_, one)| one),
+            );
+        }
+        let ids: Vec<_> = ids.into_iter().map(|(known, _)| known).collect();
+        match &ids[..] {
+            [] => None,
+            [only] => Some((*only).to_owned()),
+            [others @ .., last] if ids.len() <= MOST => Some(format!("{} or {last}", others.join(", "))),
+            _ => Some(format!("one of {} such ids", ids.len())),
+        }
+    }
+
+    /// The likely ids, or all known ones.
     fn hint(&self) -> String {
-        let likeness = |known: &str| strsim::jaro_winkler(&known.to_lowercase(), &self.id.to_lowercase());
-        let likely =
-            self.known.split(", ").map(|known| (known, likeness(known))).filter(|(_, likeness)| *likeness > 0.7);
-        match likely.max_by(|(_, one), (_, other)| one.total_cmp(other)) {
-            Some((known, _)) => format!("did you mean {known}? `endless list` shows all"),
+        match self.likely() {
+            Some(likely) => format!("did you mean {likely}? `endless list` shows all"),
             None => format!("there are {}", self.known),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_stands_for_its_ids() {
+        for (given, likely) in [
+            ("maze", Some("Maze-v0")),
+            ("Maze-Gird-v0", Some("Maze-Grid-v0")),
+            ("p-Count", Some("p-CountEasy-v0 or p-CountHard-v0")),
+            ("counthard", Some("p-CountHard-v0")),
+            ("p-", Some("one of 7 such ids")),
+            ("xyz", None),
+        ] {
+            let known = "Maze-v0, Maze-Grid-v0, p-CountEasy-v0, p-CountHard-v0, p-A, p-B, p-C, p-D, p-E".to_owned();
+            let error = UnknownEnvironment { id: given.to_owned(), known };
+            assert_eq!(error.likely().as_deref(), likely, "{given}");
         }
     }
 }

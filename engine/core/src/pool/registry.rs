@@ -74,7 +74,7 @@ impl Registry {
         self.entries.iter().map(|entry| &entry.spec)
     }
 
-    /// The specification of an id.
+    /// The specification of an id, of which only [`bare_id`](Self::bare_id) counts.
     ///
     /// # Errors
     ///
@@ -93,9 +93,14 @@ impl Registry {
         expert.ok_or_else(|| NoExpert { id: id.to_owned() })
     }
 
-    /// As in Python, an id may have the prefix `EndlessGym/`.
+    /// The id without what Python allows before it: the module that has the environment, as in `t_maze:TMaze-v0`, and `EndlessGym/`.
+    pub fn bare_id(id: &str) -> &str {
+        let id = id.rsplit(':').next().unwrap_or(id);
+        id.strip_prefix("EndlessGym/").unwrap_or(id)
+    }
+
     pub(super) fn entry(&self, id: &str) -> Result<&Arc<Entry>, UnknownEnvironment> {
-        let id = id.strip_prefix("EndlessGym/").unwrap_or(id);
+        let id = Registry::bare_id(id);
         self.entries.iter().find(|entry| entry.spec.id == id).ok_or_else(|| UnknownEnvironment {
             id: id.to_owned(),
             known: self.specs().map(|spec| spec.id).collect::<Vec<_>>().join(", "),
