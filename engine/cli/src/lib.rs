@@ -122,6 +122,7 @@ pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, 
                 *learn = settings::with_defaults(std::mem::take(learn), &arguments)?;
             }
         }
+        let arguments = options::plain_numbers(&command, arguments);
         Cli::from_arg_matches(&command.try_get_matches_from(arguments)?).map_err(Failure::from)
     };
     let cli = parse(&arguments).and_then(|cli| match cli.command {

@@ -1,7 +1,10 @@
 //! Arguments that several commands share.
 
+use std::any::TypeId;
+use std::ffi::OsString;
 use std::time::Duration;
 
+use clap::Command;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use endless_gym_core::batch::Frames;
 use endless_gym_core::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, Seeding};
@@ -67,7 +70,7 @@ pub struct EnvironmentArgs {
     /// Draw the seed of each episode from START to END - 1 in steps of STEP [default: 1]; the paper trains with
     /// 0..100000. `--seed` seeds the draws [default: episodes continue the generator of their environment].
     #[arg(long, value_name = "START..END[:STEP]", value_parser = seed_range)]
-    seed_range: Option<(u64, u64, u64)>,
+    seed_range: Option<SeedRange>,
     /// Seeds of successive episodes, starting over at the end of the list [default: as for `--seed-range`].
     #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
     seed_list: Vec<u64>,
@@ -83,8 +86,11 @@ pub struct EnvironmentArgs {
     total_envs: Option<usize>,
 }
 
+/// First seed, end and step.
+type SeedRange = (u64, u64, u64);
+
 /// Parses `START..END` or `START..END:STEP`.
-fn seed_range(text: &str) -> Result<(u64, u64, u64), String> {
+fn seed_range(text: &str) -> Result<SeedRange, String> {
     let (start, end) = text.split_once("..").ok_or("expected START..END or START..END:STEP")?;
     let (end, step) = end.split_once(':').unwrap_or((end, "1"));
     let number = |text: &str| text.parse::<u64>().map_err(|error| format!("`{text}`: {error}"));
@@ -132,6 +138,49 @@ pub fn parameters(given: &[String]) -> Result<OptionMap, Failure> {
     Ok(options)
 }
 
+/// The arguments with numbers as Rust reads them: without the `_` between digits that Python allows, as in `1_000_000`. The values of
+/// options that are texts stay.
+pub fn plain_numbers(command: &Command, mut arguments: Vec<OsString>) -> Vec<OsString> {
+    let subcommand = arguments.iter().skip(1).find_map(|argument| command.find_subcommand(argument)).unwrap_or(command);
+    let numbers = [
+        TypeId::of::<u8>(),
+        TypeId::of::<u16>(),
+        TypeId::of::<u32>(),
+        TypeId::of::<u64>(),
+        TypeId::of::<usize>(),
+        TypeId::of::<f64>(),
+        TypeId::of::<SeedRange>(),
+    ];
+    let is_number = |name: &str| {
+        let mut options = subcommand.get_arguments();
+        let option = options.find(|option| option.get_long() == Some(name));
+        option.is_some_and(|option| numbers.iter().any(|number| option.get_value_parser().type_id() == *number))
+    };
+    let mut is_value = false;
+    for argument in &mut arguments {
+        let Some(text) = argument.to_str() else { continue };
+        let (name, value) = text.split_once('=').map_or((text, None), |(name, value)| (name, Some(value)));
+        let name = name.strip_prefix("--");
+        let plain = match (name, value) {
+            (Some(name), Some(value)) if is_number(name) => Some(format!("--{name}={}", without_separators(value))),
+            (None, _) if is_value => Some(without_separators(text)),
+            _ => None,
+        };
+        is_value = value.is_none() && name.is_some_and(is_number);
+        if let Some(plain) = plain {
+            *argument = plain.into();
+        }
+    }
+    arguments
+}
+
+/// A text without each `_` between two digits.
+fn without_separators(text: &str) -> String {
+    let is_digit = |at: usize| text.as_bytes().get(at).is_some_and(u8::is_ascii_digit);
+    let is_kept = |at: usize, c| c != '_' || at == 0 || !is_digit(at - 1) || !is_digit(at + 1);
+    text.char_indices().filter(|(at, c)| is_kept(*at, *c)).map(|(_, c)| c).collect()
+}
+
 /// The duration that the argument `name` gives in seconds.
 pub fn seconds(name: &str, given: f64) -> Result<Duration, Failure> {
     match Duration::try_from_secs_f64(given) {
@@ -142,9 +191,25 @@ pub fn seconds(name: &str, given: f64) -> Result<Duration, Failure> {
 
 #[cfg(test)]
 mod tests {
-    use clap::{Arg, Command};
+    use clap::{Arg, Args};
 
     use super::*;
+
+    #[test]
+    fn only_numbers_lose_their_separators() {
+        let command = EnvironmentArgs::augment_args(Command::new("serve")).arg(Arg::new("file").long("file"));
+        let command = Command::new("endless").subcommand(command);
+        for (given, expected) in [
+            ("--seed 1_000 --seed=2_000", "--seed 1000 --seed=2000"),
+            ("--seed-range 0..100_000:1_0 --seed-list 1_0,2_0", "--seed-range 0..100000:10 --seed-list 10,20"),
+            ("--seed _1 --seed 1_ --seed 1__0", "--seed _1 --seed 1_ --seed 1__0"),
+            ("--file 1_000 --option a=1_0 1_0 --seed", "--file 1_000 --option a=1_0 1_0 --seed"),
+        ] {
+            let arguments = format!("endless serve {given}").split(' ').map(OsString::from).collect();
+            let plain: Vec<_> = plain_numbers(&command, arguments).into_iter().skip(2).collect();
+            assert_eq!(plain, expected.split(' ').collect::<Vec<_>>(), "{given}");
+        }
+    }
 
     #[test]
     fn autoreset_modes_are_parsed_from_both_spellings() {

@@ -273,7 +273,7 @@ const PAPER_STEPS_PER_UPDATE: u64 = 32 * 512;
 
 /// Largest number of steps of an update, and largest size of a layer. Beyond, a mistyped number would use up the memory of the machine.
 const MAX_STEPS: usize = 1 << 24;
-const MAX_WIDTH: u64 = 16_384;
+pub(crate) const MAX_WIDTH: u64 = 16_384;
 /// Largest number of environments, steps or parts.
 const MAX_COUNT: u64 = u32::MAX as u64;
 
@@ -486,7 +486,7 @@ const SHARE: Rule = ("a number from 0 to 1", |x| (0.0..=1.0).contains(x));
 
 /// A parser of numbers.
 fn number((rule, fits): Rule) -> impl Fn(&str) -> Result<f64, String> + Clone {
-    move |text| text.replace('_', "").parse().ok().filter(fits).ok_or_else(|| format!("must be {rule}"))
+    move |text| text.parse().ok().filter(fits).ok_or_else(|| format!("must be {rule}"))
 }
 
 /// A parser of integers.

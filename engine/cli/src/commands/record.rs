@@ -4,14 +4,14 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 use endless_gym_core::pool::{PoolConfig, PoolError, Registry, ResetOptions, Seeding};
 
 use crate::failure::Failure;
 use crate::film::Film;
 use crate::film::file::{FilmFile, Shape};
 use crate::film::picture::View;
-use crate::options::parameters;
+use crate::options::{parameters, plain_numbers};
 use crate::output::print;
 use crate::policies::Policy;
 use crate::stop;
@@ -80,7 +80,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
             .into());
     }
     let arguments = std::iter::once("endless record".into()).chain(args.arguments.iter().cloned());
-    film(registry, &FilmArgs::try_parse_from(arguments)?)
+    film(registry, &FilmArgs::try_parse_from(plain_numbers(&FilmArgs::command(), arguments.collect()))?)
 }
 
 impl FilmArgs {
