@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::io::{Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -250,6 +250,10 @@ fn errors_of_arguments_are_one_clear_line() {
         (vec!["bench", "--seconds", "inf"], "--seconds must be finite and positive, got inf"),
         (vec!["bench", "--seconds", "0"], "--seconds must be finite and positive, got 0"),
         (vec!["bench", "--env", "Chess-v0"], "no environment `Chess-v0`"),
+        (
+            vec!["bench", "--original", "/no/python,/other", "--seconds", "0.01", "--rounds", "1"],
+            "; cannot run /other: ",
+        ),
         (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "cannot run /no/python: "),
     ] {
         let output = place.run(&arguments);
@@ -433,4 +437,25 @@ fn a_closed_pipe_is_not_a_failure() {
     place.wait_for_engine();
     engine.interrupt();
     place.assert_nothing_left();
+}
+
+#[test]
+fn bench_measures_an_original_with_the_python_that_has_it() {
+    let place = Place::new();
+    let lacks = place.script("lacks", "echo \"ModuleNotFoundError: No module named 'popgym'\" >&2; exit 1");
+    let has = place.script("has", "echo pygame 2.4.0; echo 1250.5");
+    let bench = "bench --env popgym-RepeatFirstEasy-v0 --num-envs 1_0 --seconds 0.01 --rounds 1 --json --original";
+    let measure = |pythons: &[&PathBuf]| {
+        let pythons = pythons.iter().map(|python| python.display().to_string()).collect::<Vec<_>>().join(",");
+        place.run(&bench.split(' ').chain([&*pythons]).collect::<Vec<_>>())
+    };
+    let rows: Json = serde_json::from_str(text(&measure(&[&lacks, &has]).stdout)).unwrap();
+    assert_eq!(rows[0]["num_envs"], 10);
+    let last = rows[0]["measurements"].as_array().unwrap().last().unwrap();
+    assert_eq!((&last["method"], &last["steps_per_second"]), (&"original".into(), &1250.5.into()));
+    let failed = measure(&[&lacks]);
+    assert!(
+        text(&failed.stderr)
+            .contains("lacks cannot measure the original: ModuleNotFoundError: No module named 'popgym'")
+    );
 }

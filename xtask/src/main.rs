@@ -82,6 +82,9 @@ enum Task {
         /// POPGym, in place of Memory Gym.
         #[arg(long)]
         popgym: bool,
+        /// Both, each in an environment of its own, separated by a comma, as for `endless bench --env all --original`.
+        #[arg(long, conflicts_with = "popgym")]
+        all: bool,
     },
 }
 
@@ -107,7 +110,11 @@ fn main() -> ExitCode {
         Task::Soak(Arguments { arguments }) => rust::faults("soak", &arguments),
         Task::Live { steps } => rust::test_original(Some(steps)),
         Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), minutes),
-        Task::Original { popgym } => python::original(popgym).map(|python| println!("{}", python.display())),
+        Task::Original { popgym, all } => {
+            let suites = [false, true].into_iter().filter(|suite| all || *suite == popgym);
+            let paths = suites.map(|suite| Ok(python::original(suite)?.display().to_string()));
+            paths.collect::<Result<Vec<_>, _>>().map(|paths| println!("{}", paths.join(",")))
+        }
     };
     let Err(message) = result else { return ExitCode::SUCCESS };
     eprintln!("xtask: {message}");

@@ -46,10 +46,10 @@ pub struct Args {
     /// Measurements of each method, at least 1.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..))]
     pub rounds: u16,
-    /// Also measure the original, with this Python interpreter, which must have `memory-gym` or `popgym` installed [default:
-    /// the original is not measured].
-    #[arg(long, value_name = "PYTHON")]
-    original: Option<String>,
+    /// Also measure the original, with the first of these Python interpreters that has it, `memory-gym` or `popgym` [default: the
+    /// original is not measured].
+    #[arg(long, value_name = "PYTHON,..", value_delimiter = ',')]
+    original: Vec<String>,
     #[command(flatten)]
     environment: EnvironmentArgs,
     /// Print JSON [default: text].
@@ -128,7 +128,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
         methods.push(Method::InProcess { threads: cores });
     }
     methods.extend([Method::ServiceReceives, Method::ServiceReads]);
-    methods.extend(args.original.as_ref().map(|_| Method::Original));
+    methods.extend((!args.original.is_empty()).then_some(Method::Original));
 
     let measurements = specs.len() * methods.len() * usize::from(args.rounds);
     let bar = progress(measurements as u64, "measuring {bar:40} {pos}/{len}  {msg}");
@@ -370,9 +370,19 @@ fn sum(batch: &Batch<'_>) -> u64 {
     sums.iter().fold(0, |sum, part| sum.wrapping_add(*part))
 }
 
-/// Steps per second of the original.
+/// Steps per second of the original, by the first Python that can measure it.
 fn original(args: &Args, spec: &EnvSpec) -> Result<f64, Failure> {
-    let python = args.original.as_deref().unwrap_or("python3");
+    let mut reasons = Vec::new();
+    for python in &args.original {
+        match original_by(python, args, spec) {
+            Ok(speed) => return Ok(speed),
+            Err(reason) => reasons.push(reason.to_string()),
+        }
+    }
+    Err(reasons.join("; ").into())
+}
+
+fn original_by(python: &str, args: &Args, spec: &EnvSpec) -> Result<f64, Failure> {
     let output = Command::new(python)
         .args(["-c", ORIGINAL, spec.id, &args.seconds.to_string()])
         .output()
