@@ -93,3 +93,55 @@ fn a_program_serves_an_environment_that_its_trainer_does_not_know() {
     drop(trainer);
     engine.interrupt();
 }
+
+#[test]
+fn an_agent_learns_in_an_environment_that_its_program_does_not_know() {
+    let place = Place::new();
+    let run = place.root().join("run");
+    let serve = "serve --env TMaze-v0 --num-envs 4 --groups 2 --features --no-frames --autoreset same-step --service maze \
+                 --seed 1 --seed-range 0..100_000 --option length=2";
+    let mut engine =
+        Process::spawn(place.command(example("t_maze")).args(serve.split_whitespace()).stdout(Stdio::null()));
+    place.trainer("maze").unwrap();
+    let sizes = "--ppo.steps 16 --recurrence.sequence-length 8 --recurrence.hidden-size 8 --ppo.updates";
+    let learn = |arguments: String| {
+        let output = place.run(&std::iter::once("learn").chain(arguments.split_whitespace()).collect::<Vec<_>>());
+        (output.status.code(), text(&output.stdout).to_owned() + text(&output.stderr))
+    };
+    let run = run.display();
+    let (status, printed) = learn(format!("t_maze:TMaze-v0 --connect maze --run {run} {sizes} 2"));
+    assert_eq!(status, Some(0), "{printed}");
+    assert!(printed.contains(&format!("endless learn --resume {run} --connect maze --ppo.updates 4")), "{printed}");
+    let (status, printed) = learn(format!("--resume {run} --connect maze --ppo.updates 4"));
+    assert!(status == Some(0) && printed.contains("4 of 4 updates done"), "{printed}");
+    // The same numbers as in a program that has the environment.
+    let here = place.root().join("here");
+    let arguments = format!(
+        "learn TMaze-v0 --run {} --environment.num-envs 8 --environment.groups 2 --environment.option length=2 {sizes} 4",
+        here.display()
+    );
+    let output = place.command(example("t_maze")).args(arguments.split_whitespace()).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let rows = |run: &dyn std::fmt::Display| {
+        let text = std::fs::read_to_string(format!("{run}/progress.jsonl")).unwrap();
+        let row = |line: &str| {
+            let row: serde_json::Value = serde_json::from_str(line).unwrap();
+            ["loss", "episode/success"].map(|name| row[name].clone())
+        };
+        text.lines().map(row).collect::<Vec<_>>()
+    };
+    assert_eq!(rows(&run), rows(&here.display()));
+    assert!(rows(&run).len() == 4 && rows(&run)[3].iter().all(serde_json::Value::is_f64));
+    for (arguments, message) in [
+        (format!("--resume {run}"), "no environment `TMaze-v0`; ".to_owned()),
+        (format!("--resume {run}"), "; for one that another program serves, add --connect SERVICE".to_owned()),
+        (
+            format!("MysteryPath-v0 --connect maze --run {run}2"),
+            "must serve 2 groups of 4 environments MysteryPath-v0".to_owned(),
+        ),
+    ] {
+        let (status, printed) = learn(arguments);
+        assert!(status == Some(1) && printed.contains(&message), "{printed}");
+    }
+    engine.interrupt();
+}

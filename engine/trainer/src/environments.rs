@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use endless_gym_core::batch::{Batch, BatchBuffer, BatchSection, Section};
+use endless_gym_core::batch::{Batch, BatchBuffer};
 use endless_gym_core::envs::{EnvSpec, ObservationSpace};
 use endless_gym_core::pool::{
     Autoreset, EnvReset, Pool, PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, Seeding, Threads,
@@ -11,7 +11,8 @@ use endless_gym_core::pool::{
 use endless_gym_service::{BatchLease, Trainer};
 
 use crate::error::Error;
-use crate::settings::Settings;
+use crate::served;
+use crate::settings::{MAX_WIDTH, Settings};
 
 /// Seeds of the training episodes, as in the paper. Evaluation uses others, so its levels are never seen in training.
 const TRAINING_SEEDS: u64 = 100_000;
@@ -42,13 +43,7 @@ enum Stepping {
 /// [`Error::Unsupported`], or an unknown id or reset parameter.
 pub fn pool_config(registry: &Registry, settings: &Settings) -> Result<PoolConfig, Error> {
     let spec = registry.spec(&settings.env).map_err(PoolError::from)?;
-    let unsupported = |what| Err(Error::Unsupported { id: spec.id.to_owned(), what });
-    if spec.action_space.branches().is_empty() {
-        return unsupported("its actions are real numbers; the agents choose among discrete actions");
-    }
-    if spec.features.is_empty() && spec.vector_observation == 0 {
-        return unsupported("it has no features; use `endless-train` for frames");
-    }
+    check(spec)?;
     let wanted = &settings.environment;
     let num_envs = wanted.num_envs / wanted.groups;
     let seeding = Seeding::Range { start: 0, end: TRAINING_SEEDS, step: 1, seed: Some(settings.seed) };
@@ -60,6 +55,21 @@ pub fn pool_config(registry: &Registry, settings: &Settings) -> Result<PoolConfi
         .features(true);
     config.validate(spec)?;
     Ok(config)
+}
+
+/// Checks that the agents support these environments.
+fn check(spec: &EnvSpec) -> Result<(), Error> {
+    let unsupported = |what| Err(Error::Unsupported { id: spec.id.to_owned(), what });
+    if spec.action_space.branches().is_empty() {
+        return unsupported("its actions are real numbers; the agents choose among discrete actions");
+    }
+    if spec.features.is_empty() && spec.vector_observation == 0 {
+        return unsupported("it has no features; use `endless-train` for frames");
+    }
+    if observation_width(spec) > MAX_WIDTH as usize {
+        return unsupported("its observations have more than 16,384 numbers, with one for each value of an integer");
+    }
+    Ok(())
 }
 
 impl Environments {
@@ -79,20 +89,22 @@ impl Environments {
             Ok((pool, buffer))
         };
         let pools = (0..wanted.groups).map(pool).collect::<Result<Vec<_>, Error>>()?;
-        Self::new(registry, settings, Stepping::InProcess(pools))
+        let spec = registry.spec(&settings.env).map_err(PoolError::from)?.clone();
+        Ok(Self::new(spec, settings, Stepping::InProcess(pools)))
     }
 
-    /// The environments of an engine, which serves those of [`pool_config`] in as many groups as the settings say.
+    /// The environments of an engine, as many as the settings say. The engine describes them, so the program need not have them.
     ///
     /// # Errors
     ///
-    /// [`Error::Settings`] if it serves others.
-    pub fn served(registry: &Registry, settings: &Settings, trainer: Trainer) -> Result<Self, Error> {
-        let (served, config) = (trainer.specification(), pool_config(registry, settings)?);
-        let features = registry.spec(&settings.env).map_err(PoolError::from)?.features.len();
-        let expected = (&*config.id, config.num_envs, settings.environment.groups, config.autoreset, features);
-        let features = served.batch.section(BatchSection::Features).map_or(0, Section::width);
-        let given = (&*served.id, served.num_envs, served.groups, served.autoreset, features);
+    /// [`Error::Settings`] if it serves others, and [`Error::Unsupported`].
+    pub fn served(settings: &Settings, trainer: Trainer) -> Result<Self, Error> {
+        let (served, wanted) = (trainer.specification(), &settings.environment);
+        let spec = served::spec(served)?;
+        check(&spec)?;
+        let (id, num_envs) = (Registry::bare_id(&settings.env), wanted.num_envs / wanted.groups);
+        let expected = (id, num_envs, wanted.groups, Autoreset::SameStep, spec.features.len());
+        let given = (&*served.id, served.num_envs, served.groups, served.autoreset, served.features.len());
         if given != expected {
             let text = |(id, num_envs, groups, autoreset, features): (&str, usize, usize, Autoreset, usize)| {
                 format!(
@@ -102,12 +114,12 @@ impl Environments {
             return Err(Error::Settings(format!("the engine must serve {}, got {}", text(expected), text(given))));
         }
         let latest = (0..served.groups).map(|_| None).collect();
-        Self::new(registry, settings, Stepping::Served { trainer: Box::new(trainer), latest })
+        Ok(Self::new(spec, settings, Stepping::Served { trainer: Box::new(trainer), latest }))
     }
 
-    fn new(registry: &Registry, settings: &Settings, place: Stepping) -> Result<Self, Error> {
-        let (spec, wanted) = (registry.spec(&settings.env).map_err(PoolError::from)?.clone(), &settings.environment);
-        Ok(Environments { spec, groups: wanted.groups, per_group: wanted.num_envs / wanted.groups, place })
+    fn new(spec: EnvSpec, settings: &Settings, place: Stepping) -> Self {
+        let wanted = &settings.environment;
+        Environments { spec, groups: wanted.groups, per_group: wanted.num_envs / wanted.groups, place }
     }
 
     /// Number of choices of each branch of the action.
@@ -220,8 +232,7 @@ impl Environments {
 
     /// Width of the observations that [`observe`](Self::observe) writes.
     pub fn observation_width(&self) -> usize {
-        let features = self.spec.observation_space.as_ref().map_or(self.spec.features.len(), encoded_width);
-        features + self.spec.vector_observation
+        observation_width(&self.spec)
     }
 
     /// Writes the last observations of a group, float32 (n, width): the features, then the vector observation. Integers of discrete
@@ -241,6 +252,10 @@ impl Environments {
             );
         }
     }
+}
+
+fn observation_width(spec: &EnvSpec) -> usize {
+    spec.observation_space.as_ref().map_or(spec.features.len(), encoded_width) + spec.vector_observation
 }
 
 /// Numbers that encode an observation of a space.

@@ -26,6 +26,7 @@ pub mod minibatches;
 pub mod network;
 pub mod rollout;
 pub mod run_folder;
+mod served;
 pub mod settings;
 pub mod threads;
 pub mod update;
@@ -166,11 +167,12 @@ pub fn learn(
     if let Some(reason) = reason {
         print(reason);
     }
-    let (updates, run) = (settings.ppo.updates, run.display());
+    let (updates, run, connect) = (settings.ppo.updates, run.display(), &settings.connect);
+    let connect = if connect.is_empty() { String::new() } else { format!(" --connect {connect}") };
     let (verb, more) = match update < updates {
         true => ("continue", String::new()),
         false => ("train longer", format!(" --ppo.updates {}", 2 * update)),
     };
-    print(format_args!("{update} of {updates} updates done; {verb} with: endless learn --resume {run}{more}"));
+    print(format_args!("{update} of {updates} updates done; {verb} with: endless learn --resume {run}{connect}{more}"));
     Ok(folder.path.clone())
 }

@@ -246,10 +246,10 @@ fn a_run_with_an_engine_is_the_same_as_in_process() {
     let _wrong = Engine::new(memory_gym(), &wrong).unwrap();
     let connect = ConnectConfig::new("learn").namespace(namespace).timeout(Duration::from_secs(10));
     let other = Trainer::connect(&connect.clone().service("wrong".to_owned())).unwrap();
-    let error = Environments::served(memory_gym(), &settings, other).err().unwrap().to_string();
+    let error = Environments::served(&settings, other).err().unwrap().to_string();
     assert!(error.contains("same_step and 0 features"), "{error}");
     let trainer = Trainer::connect(&connect).unwrap();
-    let environments = |settings: &Settings| Environments::served(memory_gym(), settings, trainer);
+    let environments = |settings: &Settings| Environments::served(settings, trainer);
     let run = learn(&settings, environments, &AtomicBool::new(false)).unwrap();
     assert_same(&expected, &run);
 }

@@ -26,6 +26,8 @@ pub fn run(registry: &Registry, settings: &Settings) -> Result<(), Failure> {
         let trainer = Trainer::connect(&config)?;
         settings = settings.of_engine(trainer.specification())?;
         Some(trainer)
+    } else if let Err(unknown) = registry.spec(&settings.env) {
+        return Err(format!("{unknown}; for one that another program serves, add --connect SERVICE").into());
     } else if settings.environment.engine == Place::Process {
         let (pool, wanted) = (pool_config(registry, &settings)?, &settings.environment);
         let config = EngineConfig::new("endless", pool, wanted.num_threads).groups(wanted.groups);
@@ -34,7 +36,7 @@ pub fn run(registry: &Registry, settings: &Settings) -> Result<(), Failure> {
         None
     };
     let environments = |settings: &Settings| match trainer {
-        Some(trainer) => Environments::served(registry, settings, trainer),
+        Some(trainer) => Environments::served(settings, trainer),
         None => Environments::in_process(registry, settings),
     };
     endless_gym_trainer::learn(&settings, environments, stop)?;
