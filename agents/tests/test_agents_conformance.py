@@ -1,6 +1,10 @@
 """The checks of a memory: all memories of the package pass them, and memories with mistakes do not."""
 
+import contextlib
+import os
+import pty
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -149,6 +153,23 @@ def test_the_program_prints_the_checks_and_fails_if_one_fails(
         assert ("FAILED  agreement" in printed.out) == bool(status)
         assert "the last check plays 200 steps and is the longest: about " in printed.err
     assert "own.py:Rounds fails agreement" in printed.err
+
+
+def test_a_terminal_shows_how_much_of_the_time_has_passed(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(MISTAKES)
+    terminal, other = pty.openpty()
+    command = [sys.executable, "-m", "endless_gym_agents.conformance", "own.py:Plain", "--steps", "300"]
+    env = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
+    with subprocess.Popen(command, cwd=tmp_path, env=env, stdout=other, stderr=other) as process:
+        os.close(other)
+        shown = b""
+        with contextlib.suppress(OSError):  # the end of the program
+            while part := os.read(terminal, 10_000):
+                shown += part
+    os.close(terminal)
+    text = shown.decode()
+    assert process.returncode == 0 and "passed  finite" in text
+    assert re.search(r"checking \S*━+.*0:00:0\d", text)
 
 
 def test_an_agent_without_memory_is_refused() -> None:

@@ -28,6 +28,8 @@ from typing import Any
 
 import torch
 import tyro
+from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn
+from rich.progress_bar import ProgressBar
 from torch import Tensor
 
 from endless_gym_agents.agent.agent import Agent
@@ -272,6 +274,15 @@ class ConformanceArguments:
     """device of the memory, as for `endless-train`"""
 
 
+class TimeBar(BarColumn):
+    """How much of the estimated time has passed, in seconds, since a call that computes many steps reports no progress."""
+
+    def render(self, task: Task) -> ProgressBar:
+        """The bar; without an estimate, it pulses."""
+        task.completed = min(task.elapsed or 0.0, task.total or 0.0)
+        return super().render(task)
+
+
 def execute(given: ConformanceArguments) -> None:
     """Check a memory, and print the results.
 
@@ -279,16 +290,22 @@ def execute(given: ConformanceArguments) -> None:
         ValueError: There is no such memory, or a check has failed.
     """
     failed, start, is_first = [], time.monotonic(), True
-    for result in check(given.agent, given.agent_option, given.steps, given.long_steps, given.device):
-        verdict = "passed" if result.passed else "FAILED"
-        print(f"{verdict}  {result.name:<10} {result.measured:<10.3g} {result.allowed}", flush=True)
-        failed += [] if result.passed else [result.name]
-        if is_first:
-            # With gradients, a step takes about twice as long.
-            left = 2 * (time.monotonic() - start) * given.long_steps / given.steps
-            message = f"the last check plays {given.long_steps:,} steps and is the longest: about {duration(left)}"
-            print(message, file=sys.stderr, flush=True)
-            is_first = False
+    console = command.Terminal()
+    columns = (TextColumn("checking"), TimeBar(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("checking", total=None)
+        for result in check(given.agent, given.agent_option, given.steps, given.long_steps, given.device):
+            verdict = "passed" if result.passed else "FAILED"
+            print(f"{verdict}  {result.name:<10} {result.measured:<10.3g} {result.allowed}", flush=True)
+            failed += [] if result.passed else [result.name]
+            if is_first:
+                # With gradients, a step takes about twice as long.
+                taken = time.monotonic() - start
+                left = 2 * taken * given.long_steps / given.steps
+                message = f"the last check plays {given.long_steps:,} steps and is the longest: about {duration(left)}"
+                print(message, file=sys.stderr, flush=True)
+                bar.update(task, total=taken + left)
+                is_first = False
     if failed:
         raise ValueError(
             f"{given.agent} fails {', '.join(failed)}; the documentation of the module describes the checks"
