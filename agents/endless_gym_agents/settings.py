@@ -6,6 +6,7 @@ follow the hyperparameter table of the paper where possible.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import json
@@ -17,7 +18,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorWrapper
 from torch import nn
 
-from endless_gym.specs import DEFAULT_ENV_ID, Frames, Spec, all_specs, spec
+from endless_gym.specs import DEFAULT_ENV_ID, Frames, Spec, spec
 from endless_gym_agents.common import own, ranges
 from endless_gym_agents.common.own import MEMORIES
 from endless_gym_agents.common.ranges import AboveZero, Finite, FromZero, Natural, Positive, Range, Share
@@ -77,6 +78,11 @@ class Environment:
     """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
     num_threads: Natural = 0
     """threads that step the environments; 0 for one per core"""
+
+    @property
+    def own_wrappers(self) -> tuple[str, ...]:
+        """The wrappers that are not the package's."""
+        return tuple(wrapper for wrapper in self.wrapper if wrapper not in (VECTORS, ONE_HOT))
 
     def fitted(self, described: Spec, vectors: str = VECTORS) -> Environment:
         """These settings with features if there are no frames, and with the wrapper `vectors` if there is none for integers."""
@@ -523,6 +529,8 @@ def from_dict(values: dict[str, Any]) -> Settings:
     # JSON has lists for tuples.
     environment = values["environment"]
     environment = dataclasses.replace(environment, option=tuple(environment.option), wrapper=tuple(environment.wrapper))
-    described = all_specs().get(values.get("env", DEFAULT_ENV_ID).removeprefix("EndlessGym/"))
-    values["environment"] = environment.fitted(described, ONE_HOT) if described else environment
+    # An unknown id is reported where its environments are made.
+    with contextlib.suppress(TypeError, ValueError):
+        environment = environment.fitted(spec(values.get("env", DEFAULT_ENV_ID)), ONE_HOT)
+    values["environment"] = environment
     return Settings(**values | {name: tuple(values.get(name, ())) for name in ("agent_option", "encoder_option")})

@@ -11,8 +11,10 @@ import pytest
 from agents_helpers import saved, settings
 
 from endless_gym.recording import record
+from endless_gym.specs import spec
 from endless_gym_agents.evaluation.evaluate import evaluate
 from endless_gym_agents.evaluation.record import AgentPlayer
+from endless_gym_agents.settings import ONE_HOT, VECTORS
 
 pytestmark = pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
 
@@ -52,6 +54,34 @@ def test_recorded_episodes_equal_evaluated_ones(agent: str, tmp_path: Path) -> N
     episodes = list(load(recorded.dataset))
     assert [len(episode) for episode in episodes] == [result["length"] for result in results]
     assert [episode.rewards.sum() for episode in episodes] == pytest.approx([result["reward"] for result in results])
+
+
+@pytest.mark.parametrize("wrapper", [VECTORS, ONE_HOT])
+@pytest.mark.parametrize("id", ["popgym-RepeatPreviousEasy-v0", "popgym-AutoencodeEasy-v0"])
+def test_integers_are_recorded_as_the_environment_returns_them(id: str, wrapper: str, tmp_path: Path) -> None:
+    made = saved(tmp_path, settings("gru", env=id, environment={"wrapper": (wrapper,)}))
+    recorded = record(id, 6, policy=AgentPlayer(made, greedy=True), seed=200_000, num_threads=1)
+    dataset, results = load(recorded.dataset), evaluate(made, range(200_000, 200_006), 1, greedy=True)
+    assert dataset.observation_space == spec(id).observation_space(None, True)
+    assert [len(episode) for episode in dataset] == [result["length"] for result in results]
+    assert [episode.rewards.sum() for episode in dataset] == pytest.approx([result["reward"] for result in results])
+
+
+def test_agents_see_the_actions_that_were_played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    id = "popgym-RepeatPreviousEasy-v0"
+    made = saved(tmp_path, settings("gru", env=id, environment={"wrapper": (VECTORS,)}))
+    seen: list[Any] = []
+    act = made.act
+    monkeypatch.setattr(
+        made, "act", lambda observation, *given: (seen.append(observation), act(observation, *given))[1]
+    )
+    recorded = record(id, 1, policy=AgentPlayer(made), error_rates=0.5, num_threads=1)
+    (episode,) = load(recorded.dataset)
+    # Suit, previous action, and whether the step is the first.
+    vectors = np.concatenate(seen)
+    assert vectors[:, :4].argmax(1).tolist() == episode.observations[:-1].tolist()
+    assert vectors[1:, 4:8].argmax(1).tolist() == episode.actions[:-1].tolist()
+    assert vectors[:, 9].tolist() == [1.0] + [0.0] * (len(episode) - 1)
 
 
 def test_sampled_actions_depend_only_on_the_seed(tmp_path: Path) -> None:

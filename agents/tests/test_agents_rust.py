@@ -23,9 +23,9 @@ from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common.clock import Clock
 from endless_gym_agents.common.command import STOP_SIGNALS
 from endless_gym_agents.environments.groups import Environments
-from endless_gym_agents.evaluation import enjoy, export, plot, protocol
+from endless_gym_agents.evaluation import enjoy, export, plot, protocol, record
 from endless_gym_agents.evaluation.evaluate import evaluate
-from endless_gym_agents.settings import PAPER_STEPS_PER_UPDATE, PRESETS, Settings, paper_run_length, value
+from endless_gym_agents.settings import ONE_HOT, PAPER_STEPS_PER_UPDATE, PRESETS, Settings, paper_run_length, value
 from endless_gym_agents.training import checkpoint, ppo
 from endless_gym_agents.training.logs import read_progress
 from endless_gym_agents.training.rollout import RolloutCollector
@@ -124,6 +124,25 @@ def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     row = read_progress(run)[-1]
     assert [event.step for event in events.Scalars("learning/loss")] == [128, 256, 384]
     assert events.Scalars("episode/reward")[-1].value == pytest.approx(row["episode/reward"])
+
+
+@pytest.mark.parametrize("id", ["popgym-AutoencodeEasy-v0", "endless_gym:popgym-RepeatPreviousEasy-v0"])
+def test_a_run_in_an_environment_of_integers_is_recorded_and_exported(
+    id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Python imports the module before the `:`, which the program has.
+    run, out = new_run(tmp_path / "run", "--ppo.updates 1", id), tmp_path / "agent.safetensors"
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    programs = [(record, ["--episodes", "3"]), (export, ["--out", str(out), "--vectors", str(tmp_path / "vectors")])]
+    for program, arguments in programs:
+        monkeypatch.setattr(sys, "argv", ["program", str(run), *arguments])
+        assert program.main() == 0
+    printed = capsys.readouterr().out
+    assert "\n3 episodes, " in f"\n{printed}" and "the page does not" in printed
+    exported, trained = checkpoint.load(out), checkpoint.load(run)
+    assert exported.settings.environment.wrapper == trained.settings.environment.wrapper == (ONE_HOT,)
+    results = [evaluate(each.agent, range(200_000, 200_003), 1, greedy=True) for each in (exported, trained)]
+    assert [result["length"] for result in results[0]] == [result["length"] for result in results[1]]
 
 
 def test_an_episode_of_a_run_is_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

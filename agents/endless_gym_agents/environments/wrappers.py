@@ -11,11 +11,13 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym.create import make_vec
 from endless_gym.requests.results import Step
+from endless_gym.specs import spec
 from endless_gym.vector import EndlessVectorEnv
 from endless_gym_agents.common import own
 from endless_gym_agents.environments.recovery import RecoverableEngine
@@ -58,6 +60,33 @@ class Group(VectorEnv[Any, Any, NDArray[Any]]):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environments."""
         self._envs.close()
+
+
+class Observed(VectorEnv[Any, Any, NDArray[Any]]):
+    """Environments that others play, without rewards and ends, for wrappers that depend on observations and actions only.
+
+    Attributes:
+        observation: What the next `reset` or `step` returns.
+    """
+
+    def __init__(self, settings: Settings, num_envs: int) -> None:
+        """Stand for environments of a run."""
+        described = spec(settings.env)
+        self.num_envs, self.metadata = num_envs, {"autoreset_mode": AutoresetMode.DISABLED}
+        self.single_observation_space = described.observation_space(None, True)
+        self.single_action_space = described.action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation: Any = None
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        """Return the observation."""
+        return self.observation, {}
+
+    def step(self, actions: Any) -> Step:
+        """Return the observation."""
+        none = np.zeros(self.num_envs, np.bool_)
+        return self.observation, none.astype(np.float64), none, none, {}
 
 
 class WrappedGroups:

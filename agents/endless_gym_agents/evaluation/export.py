@@ -23,12 +23,12 @@ import torch
 import tyro
 
 from endless_gym._native import PAGE_AGENTS
-from endless_gym.create import make_vec
 from endless_gym.program.printable import printable
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common import atomic, command
 from endless_gym_agents.common.ranges import Positive
+from endless_gym_agents.environments import wrappers
 from endless_gym_agents.evaluation.evaluate import evaluate, mean
 from endless_gym_agents.settings import Settings, to_dict
 from endless_gym_agents.training.checkpoint import Checkpoint, load, protected, to_safetensors
@@ -105,7 +105,7 @@ def evaluations(agent: Agent) -> list[dict[str, Any]]:
 
 
 def check(settings: Settings, agent: Agent) -> None:
-    """Raise an error if the page cannot compute this agent.
+    """Raise an error if the page cannot compute this agent, unless only since its environment returns integers.
 
     Raises:
         ValueError: The agent is not one of `PAGE_AGENTS`, has parts of your own, or observes more than features.
@@ -113,7 +113,7 @@ def check(settings: Settings, agent: Agent) -> None:
     wrong = {
         f"--agent must be {', '.join(PAGE_AGENTS)}": settings.agent not in PAGE_AGENTS and settings.agent,
         "--encoder must be the package's": settings.encoder,
-        "--environment.wrapper must be empty": " ".join(settings.environment.wrapper),
+        "--environment.wrapper must be empty": " ".join(settings.environment.own_wrappers),
         "the observation must be `features` alone": list(agent.observation_shapes) != ["features"]
         and list(agent.observation_shapes),
     }
@@ -136,9 +136,7 @@ def record_vectors(agent: Agent, steps: int) -> dict[str, Any]:
     settings, env_spec = agent.settings, spec(agent.settings.env)
     generator, memory = torch.Generator().manual_seed(VECTORS_SEED), agent.initial_memory(1)
     recorded: dict[str, Any] = {"env": env_spec.id, "reset": [], "features": [], "logits": [], "action": []}
-    with make_vec(
-        settings.env, 1, 1, seed=VECTORS_SEED, options=settings.options(), autoreset="same_step", observation="features"
-    ) as envs:
+    with wrappers.make(settings, 1, 1, seed=VECTORS_SEED) as envs:
         observation, _ = envs.reset()
         for _ in range(steps):
             observed, transform_update = agent.observe(agent.to_tensors(observation), memory)
@@ -172,6 +170,10 @@ def execute(arguments: ExportArguments) -> None:
         evaluation = evaluations(agent)
         atomic.write(arguments.out, export(checkpoint, evaluation))
         print(f"{printable(arguments.out)}: {arguments.out.stat().st_size} bytes, {evaluation}")
+        if agent.settings.environment.wrapper:
+            print(
+                "the programs of this package read it; the page does not, since it has no agents that observe integers"
+            )
     if arguments.vectors is not None:
         vectors = record_vectors(agent, arguments.vector_steps)
         atomic.write(arguments.vectors, json.dumps(vectors, separators=(",", ":")) + "\n")

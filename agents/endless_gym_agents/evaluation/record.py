@@ -23,6 +23,7 @@ from endless_gym.recording.players import Actor
 from endless_gym.specs import ObservationName, spec
 from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common import command
+from endless_gym_agents.environments import wrappers
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.train import choose_device
 
@@ -48,14 +49,20 @@ class AgentPlayer:
     def actor(self, num_envs: int, first_episode: int) -> Actor:
         """The agent acting in `num_envs` environments, with a new memory and generator."""
         agent, memory = self._agent, self._agent.initial_memory(num_envs)
+        observed = wrappers.Observed(agent.settings, num_envs)
+        wrapped = wrappers.wrap(agent.settings, observed)
         state = np.random.SeedSequence([self._action_seed, first_episode]).generate_state(1, np.uint64)
         generator = torch.Generator(agent.device).manual_seed(int(state[0] >> 1))
 
         def act(
-            observation: Mapping[str, NDArray[Any]], episode_start: NDArray[np.bool_], active: NDArray[np.bool_]
+            observation: Mapping[str, Any], episode_start: NDArray[np.bool_], active: NDArray[np.bool_]
         ) -> NDArray[np.int64]:
             memory.reset(episode_start)
-            action = agent.act(observation, memory, generator, self._greedy).action
+            seen: Any = observation
+            if wrapped is not observed:
+                observed.observation, previous = observation["features"], observation.get("previous_action")
+                seen = (wrapped.reset() if previous is None else wrapped.step(previous))[0]
+            action = agent.act(seen, memory, generator, self._greedy).action
             return self._spec.batched_actions(action.cpu().numpy())
 
         return act
@@ -65,10 +72,10 @@ def execute(given: Namespace) -> None:
     """Record the episodes, and print what was recorded."""
     agent = checkpoint.load(given.checkpoint, choose_device(given.device)).agent
     settings = agent.settings
-    if settings.environment.wrapper:
+    if own := settings.environment.own_wrappers:
         raise ValueError(
             "a data set contains the environment's own observations and rewards; got an agent that was trained with "
-            f"--environment.wrapper {' '.join(settings.environment.wrapper)}"
+            f"--environment.wrapper {' '.join(own)}"
         )
     player = AgentPlayer(agent, given.action_seed, given.greedy)
     options = settings.options()

@@ -14,7 +14,7 @@ from endless_gym.specs import Metric, spec
 from endless_gym_agents.common import regular
 from endless_gym_agents.evaluation.statistics import Summary, summarise
 from endless_gym_agents.memories import MEMORIES
-from endless_gym_agents.settings import ONE_HOT, VECTORS, Recurrence, Settings
+from endless_gym_agents.settings import Recurrence, Settings
 
 
 def metric(env: str) -> Metric:
@@ -108,8 +108,7 @@ def label(settings: Settings) -> str:
         name += f"_{settings.recurrence.hidden_size}"
     encoder = (settings.encoder.rpartition(":")[2], *settings.encoder_option) if settings.encoder else ()
     # Those that an environment has by default say nothing about the agent.
-    own = (wrapper for wrapper in settings.environment.wrapper if wrapper not in (VECTORS, ONE_HOT))
-    wrappers = (wrapper.rpartition(":")[2] for wrapper in own)
+    wrappers = (wrapper.rpartition(":")[2] for wrapper in settings.environment.own_wrappers)
     name += "".join(f"_{part}" for part in (*encoder, *wrappers))
     additions = {
         "_gt": settings.ppo.ground_truth_coefficient,

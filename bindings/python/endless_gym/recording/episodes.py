@@ -127,7 +127,9 @@ def play(
         while active.any():
             if stop.is_set():
                 raise Stopped
-            action = errors.apply(actor(now, start, active))
+            # Errors replace actions of the player.
+            previous = {"previous_action": actions[-1]} if actions else {}
+            action = errors.apply(actor({**now, **previous}, start, active))
             observed, reward, terminated, truncated, info = envs.step(action)
             now = parts(observed)
             for path, part in recorded():

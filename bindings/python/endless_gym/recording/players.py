@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from endless_gym.experts import Experts
 from endless_gym.specs import ObservationName, Spec
 
-#: Chooses actions. The arguments are the observations of n environments by key, whether each is the first of an episode, bool
-#: (n,), and whether each environment needs an action, bool (n,). Returns actions in the shape of a vector environment.
-Actor: TypeAlias = Callable[[Mapping[str, NDArray[Any]], NDArray[np.bool_], NDArray[np.bool_]], NDArray[Any]]
+#: Chooses actions. The arguments are the observations of n environments by key, after the first step with the actions that were
+#: played as `previous_action`; whether each is the first of an episode, bool (n,); and whether each environment needs an action,
+#: bool (n,). Returns actions in the shape of a vector environment.
+Actor: TypeAlias = Callable[[Mapping[str, Any], NDArray[np.bool_], NDArray[np.bool_]], NDArray[Any]]
 
 
 class Player(Protocol):
