@@ -115,7 +115,10 @@ def _end(process: subprocess.Popen[bytes], log: EngineLog, clients: list[_native
             _native.running_engines()
 
 
-@named(instead=INSTEAD)
+_NAME = "the engine names itself; `endless serve --service NAME` takes a name, for `connect`"
+
+
+@named(instead={**INSTEAD, "name": _NAME, "service": _NAME})
 def serve(
     id: str,
     num_envs: int = 1,

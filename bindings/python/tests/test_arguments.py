@@ -258,6 +258,12 @@ def test_unknown_arguments_are_refused_with_the_name_that_is_meant(where) -> Non
             where("MortarMayhem-Grid-v0", **{name: value})
 
 
+def test_an_engine_of_python_names_itself() -> None:
+    for name in ("name", "service"):
+        with pytest.raises(TypeError, match=rf"^serve\(\) has no argument `{name}`; the engine names itself"):
+            endless_gym.serve("MortarMayhem-Grid-v0", **{name: "mine"})
+
+
 @pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
 def test_seeds_that_do_not_fit_are_refused(where) -> None:
     largest = 2**64 - 1
