@@ -29,6 +29,7 @@ const STEPS: &[Step] = &[
     Step("python-lint", false, &[], python::lint),
     Step("python-tests", false, &[], python::test),
     Step("files", true, &[], files::check),
+    Step("clippy-features", true, &[], rust::clippy_features),
     Step("rust-ignored", true, &[], rust::test_ignored),
     Step("faults", true, &[], || rust::faults("faults", &["--minutes", "1", "--seed", "1"])),
     Step("instructions", true, &[VALGRIND], || rust::instructions(false)),
