@@ -10,10 +10,13 @@ T steps of B environments are time-major. The sizes of keys and values of H head
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
+
+from endless_gym_agents.memories.layers import undecayed
 
 #: Steps of a chunk.
 CHUNK = 64
@@ -66,8 +69,8 @@ def attention(
     u_t = v_t. With rates b, which make it the gated delta rule, u_t = b_t (v_t - a_t S_{t-1}^T k_t).
 
     Args:
-        queries: float32 (T, B, H, K).
-        keys: float32 (T, B, H, K).
+        queries: float32 (T, B, H, K), or (T, B, 1, K) if they are the same for all heads.
+        keys: float32, as `queries`.
         values: float32 (T, B, H, V).
         log_decay: log(a), at most 0, float32 (T, B, H).
         state: S before the first step, float32 (B, H, K, V).
@@ -91,7 +94,7 @@ def attention(
             u = torch.linalg.solve_triangular(mixing, u, upper=False, unitriangular=True)
         y = (between * (q @ k.mT)) @ u + before.unsqueeze(-1) * (q @ state)
         outputs.append(y.permute(2, 0, 1, 3))
-        state = before[..., -1, None, None] * state + (between[..., -1, :].unsqueeze(-1) * k).mT @ u
+        state = before[..., -1, None, None] * state + k.mT @ (between[..., -1, :].unsqueeze(-1) * u)
     return torch.cat(outputs), state
 
 
@@ -106,8 +109,20 @@ def attention_step(
     state = decay[..., None, None] * state
     if rate is not None:
         v = rate.unsqueeze(-1) * (v - (k.unsqueeze(-2) @ state).squeeze(-2))
-    state = state + k.unsqueeze(-1) * v.unsqueeze(-2)
+    state = torch.addcmul(state, k.unsqueeze(-1), v.unsqueeze(-2))
     return (q.unsqueeze(-2) @ state).squeeze(-2), state
+
+
+def decays(heads: int, smallest: float) -> tuple[nn.Parameter, nn.Parameter]:
+    """Initial values of Mamba-2's decays exp(-A dt) of heads: A uniform from `smallest` to 16, dt log-uniform from 0.001 to 0.1.
+
+    Returns:
+        log(A), and the bias b with softplus(b) = dt, float32 (heads,) each.
+    """
+    # Never log(0).
+    a = 16 - (16 - smallest) * torch.rand(heads)
+    dt = torch.exp(torch.rand(heads) * math.log(100) + math.log(0.001))
+    return undecayed(a.log()), undecayed(dt + torch.log(-torch.expm1(-dt)))
 
 
 class ShortConvolution(nn.Module):
@@ -116,17 +131,18 @@ class ShortConvolution(nn.Module):
     Its state are the previous inputs, oldest first, float32 (B, `size` - 1, channels).
     """
 
-    def __init__(self, channels: int, size: int = 4) -> None:
-        """Make the convolution with PyTorch's initial weights of a depthwise convolution."""
+    def __init__(self, channels: int, size: int = 4, bias: bool = True) -> None:
+        """Make the convolution with PyTorch's initial values of a depthwise convolution."""
         super().__init__()
-        self.size, self.state_shape = size, (size - 1, channels)
-        self.weight = nn.Parameter(torch.empty(size, channels).uniform_(-(size**-0.5), size**-0.5))
-        self.bias = nn.Parameter(torch.zeros(channels))
+        self.size, self.state_shape, limit = size, (size - 1, channels), size**-0.5
+        self.weight = nn.Parameter(torch.empty(size, channels).uniform_(-limit, limit))
+        self.bias = undecayed(torch.empty(channels).uniform_(-limit, limit)) if bias else None
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """One step of inputs float32 (B, channels); returns the outputs and the state after the step."""
         window = torch.cat([state, x.unsqueeze(1)], dim=1)
-        return nn.functional.silu((window * self.weight.flip(0)).sum(1) + self.bias), window[:, 1:]
+        y = (window * self.weight.flip(0)).sum(1)
+        return nn.functional.silu(y if self.bias is None else y + self.bias), window[:, 1:]
 
     def sequence(self, x: Tensor, state: Tensor, resets: Tensor) -> tuple[Tensor, Tensor]:
         """T steps of inputs float32 (T, B, channels); returns the outputs and the state after the last step."""
@@ -135,7 +151,7 @@ class ShortConvolution(nn.Module):
         # Steps since the episode began; the state belongs to the episode before the first reset.
         time = torch.arange(steps, device=x.device).unsqueeze(1)
         age = time - torch.where(resets, time, -self.size).cummax(0).values
-        y = self.bias + self.weight[0] * x
+        y = self.weight[0] * x if self.bias is None else torch.addcmul(self.bias, self.weight[0], x)
         for past in range(1, self.size):
             earlier = window[self.size - 1 - past : self.size - 1 - past + steps]
             y = y + self.weight[past] * earlier.masked_fill((age < past).unsqueeze(-1), 0.0)

@@ -1,7 +1,7 @@
 """Mamba-2: a selective state space model whose decay is one number per head and step.
 
 Dao and Gu, "Transformers are SSMs", 2024 (https://arxiv.org/abs/2405.21060). The layer is the parallel block of its section 7.
-With P = `head_width` channels per head, N entries of the state per channel, and one group of B and C for all heads:
+With P = `expand` * width / heads channels per head, N entries of the state per channel, and one group of B and C for all heads:
 
     (z, x, B, C, dt) = W u_t                    z, x (heads * P), B and C (N), dt (heads)
     (x, B, C) = silu(convolution of the last 4 steps)
@@ -10,17 +10,18 @@ With P = `head_width` channels per head, N entries of the state per channel, and
     y_t = S_t^T C + D x
     output: W_out RMSNorm(y * silu(z))
 
-Over sequences, it is computed as section 6 does: chunks of attention with a mask of decays.
+Over sequences, it is computed as section 6 does: chunks of attention with a mask of decays. Initial values are those of the
+authors' code, https://github.com/state-spaces/mamba. Its heads have 64 channels, however many these are; here, their number is
+fixed, so that they have about 64 at the sizes of the package's agents.
 """
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
-from endless_gym_agents.memories.attention import ShortConvolution, attention, attention_step
+from endless_gym_agents.memories.attention import ShortConvolution, attention, attention_step, decays
+from endless_gym_agents.memories.layers import divided, undecayed
 from endless_gym_agents.memories.sequence_model import SequenceModel, State
 
 
@@ -29,39 +30,38 @@ class Mamba2(SequenceModel):
 
     residual = True
 
-    def __init__(self, input_width: int, width: int, heads: int = 4, state_size: int = 32, expand: int = 2) -> None:
+    def __init__(self, input_width: int, width: int, heads: int = 4, state_size: int = 128, expand: int = 2) -> None:
         """Make the layer.
 
         Args:
             input_width: Size of the inputs.
-            width: Size of the outputs; `expand * width` must be a multiple of `heads`.
+            width: Size of the outputs.
             heads: Number of heads.
             state_size: N.
-            expand: Channels of all heads, as a multiple of `width`.
+            expand: Channels of all heads, as a multiple of `width`; a multiple of `heads`.
         """
         super().__init__()
         self.width, self.heads, self.inner, self.state_size = width, heads, expand * width, state_size
         self.parts = [self.inner, self.inner + 2 * state_size, heads]
         self.enter = nn.Linear(input_width, sum(self.parts), bias=False)
         self.convolution = ShortConvolution(self.parts[1])
-        # The paper's code draws dt log-uniformly from 0.001 to 0.1, and A uniformly from 1 to 16.
-        dt = torch.exp(torch.rand(heads) * (math.log(0.1) - math.log(0.001)) + math.log(0.001))
-        self.dt_bias = nn.Parameter(dt + torch.log(-torch.expm1(-dt)))
-        self.a_log = nn.Parameter(torch.log(torch.rand(heads) * 15 + 1))
-        self.d = nn.Parameter(torch.ones(heads))
+        self.a_log, self.dt_bias = decays(heads, 1.0)
+        self.d = undecayed(torch.ones(heads))
         self.norm = nn.RMSNorm(self.inner, eps=1e-5)
         self.leave = nn.Linear(self.inner, width, bias=False)
         self.state_shapes = {
-            "s": (heads, state_size, self.inner // heads),
+            "s": (heads, state_size, divided(self.inner, heads)),
             "convolution": self.convolution.state_shape,
         }
 
+    def stacked(self, layers: int) -> None:
+        self.leave.weight.data /= layers**0.5
+
     def split(self, convolved: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """X by head, dt x, B and C of each head, and log(a)."""
+        """X by head, dt x, B and C as those of one head, and log(a)."""
         x, b, c = convolved.split([self.inner, self.state_size, self.state_size], dim=-1)
         x, dt = x.unflatten(-1, (self.heads, -1)), nn.functional.softplus(dt + self.dt_bias)
-        b, c = (part.unsqueeze(-2).expand(*part.shape[:-1], self.heads, -1) for part in (b, c))
-        return x, dt.unsqueeze(-1) * x, b, c, -dt * self.a_log.exp()
+        return x, dt.unsqueeze(-1) * x, b.unsqueeze(-2), c.unsqueeze(-2), -dt * self.a_log.exp()
 
     def outputs(self, y: Tensor, x: Tensor, z: Tensor) -> Tensor:
         """The output from S^T C, x and z."""

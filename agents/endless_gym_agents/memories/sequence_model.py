@@ -30,8 +30,17 @@ class SequenceModel(nn.Module, ABC):
     state_shapes: dict[str, tuple[int, ...]]
     #: Whether the layer computes a change of its normalised input, x + layer(norm(x)), instead of new features.
     residual = False
+    #: What follows such a layer in its block, x + feed_forward(x), and normalises x itself; a layer need not have it.
+    feed_forward: nn.Module
     #: Whether native kernels may compute the layer on the CPU.
     native = True
+
+    def input_norm(self) -> nn.Module:
+        """A new normalisation of vectors of `width`, for residual layers."""
+        return nn.RMSNorm(self.width, eps=1e-5)
+
+    def stacked(self, layers: int) -> None:
+        """Adapt the initial weights to the number of layers of the stack, once. This default does not."""
 
     @abstractmethod
     def step(self, x: Tensor, state: State) -> tuple[Tensor, State]:
@@ -104,10 +113,11 @@ class Stack(SequenceModel):
                     f"{make.__name__} needs inputs of its width {self.layers[-1].width}, got {input_width}; add "
                     "--recurrence.embedding"
                 )
+            self.layers[-1].stacked(layers)
             input_width = self.layers[-1].width
         self.width = input_width
-        norms = layers + 1 if make.residual else 0
-        self.norms: list[nn.Module] = nn.ModuleList(nn.RMSNorm(self.width, eps=1e-5) for _ in range(norms))  # type: ignore[assignment]
+        norms = [*self.layers, self.layers[-1]] if make.residual else []
+        self.norms: list[nn.Module] = nn.ModuleList(layer.input_norm() for layer in norms)  # type: ignore[assignment]
         self.state_shapes = {
             f"{number}.{name}": shape
             for number, layer in enumerate(self.layers)
@@ -127,5 +137,7 @@ class Stack(SequenceModel):
             inputs = self.norms[number](x) if self.norms else x
             y, changed = layer.step(inputs, before) if resets is None else layer.sequence(inputs, before, resets)
             x = x + y if self.norms else y
+            if hasattr(layer, "feed_forward"):
+                x = x + layer.feed_forward(x)
             after |= {f"{number}.{name}": part for name, part in changed.items()}
         return self.norms[-1](x) if self.norms else x, after
