@@ -68,6 +68,15 @@ def test_an_exported_agent_is_read_back(tmp_path: Path) -> None:
     assert all(torch.equal(tensor, exported[name]) for name, tensor in loaded.agent.state_dict().items())
 
 
+def test_decays_that_are_no_weights_are_not_rounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(export, "evaluations", lambda agent: [])
+    run, file = trained(tmp_path, agent="retnet", agent_option=("heads=8",)), tmp_path / "agent.safetensors"
+    export.execute(export.ExportArguments(run, out=file))
+    read = checkpoint.load(file).agent.state_dict()
+    assert read["memory.cell.layers.0.gamma"].tolist() == [1 - 2.0 ** (-5 - head) for head in range(8)]
+    assert torch.equal(read["body.0.weight"], read["body.0.weight"].bfloat16().float())
+
+
 def described(content: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
     """A file with its description, the JSON text of the format, changed."""
     length = 8 + int.from_bytes(content[:8], "little")

@@ -354,6 +354,35 @@ def test_initial_values_are_those_of_the_authors() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [
+        (LRU, {"state_size": 5}),
+        (Mamba2, {"state_size": 5, "expand": 1}),
+        (GatedDeltaNet, {"key_factor": 1.25, "value_factor": 1.5}),
+        # Keys with an odd number of entries.
+        (RetNet, {"heads": 4, "value_factor": 1}),
+        (MLSTM, {}),
+        (MLSTM, {"conv": False, "expand": 1}),
+    ],
+    ids=str,
+)
+def test_sequences_with_resets_are_their_steps(
+    make: type[SequenceModel], options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attention, "CHUNK", 7)
+    torch.manual_seed(1)
+    block, steps = Stack(make, 12, 12, 2, {"heads": 2} | options if make is not LRU else options), 20
+    for parameter in block.parameters():
+        parameter.data += 0.2 * torch.randn_like(parameter)
+    x, resets = torch.randn(steps, 3, 12), torch.rand(steps, 3) < 0.2
+    before = {name: 0.1 * part.normal_().abs() for name, part in initial(block, 3).items()}
+    before = {name: part.ceil() if name.endswith("steps") else part for name, part in before.items()}
+    y, after = block.sequence(x, before, resets)
+    expected, last = SequenceModel.sequence(block, x, before, resets)
+    torch.testing.assert_close((y, after), (expected, last), rtol=1e-10, atol=1e-12)
+
+
 def test_what_follows_in_the_block_is_gated_and_residual() -> None:
     for make, activation in ((RetNet, nn.functional.gelu), (GatedDeltaNet, nn.functional.silu)):
         block, x = Stack(make, 8, 8, 1, {}), torch.randn(1, 2, 8)

@@ -165,8 +165,8 @@ def execute(arguments: ExportArguments) -> None:
     if arguments.out is not None or arguments.vectors is not None:
         check(agent.settings, agent)
     if arguments.out is not None:
-        for tensor in agent.state_dict().values():
-            tensor.copy_(tensor.bfloat16())
+        for weight in agent.parameters():
+            weight.data.copy_(weight.bfloat16())
         evaluation = evaluations(agent)
         atomic.write(arguments.out, export(checkpoint, evaluation))
         print(f"{printable(arguments.out)}: {arguments.out.stat().st_size} bytes, {evaluation}")

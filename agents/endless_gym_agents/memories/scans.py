@@ -82,4 +82,4 @@ def steps_of_episode(before: Tensor, resets: Tensor) -> Tensor:
     """The number of each step in its episode, float32 (T, B, 1), from that of the first step if no episode starts, (B, 1)."""
     time = torch.arange(len(resets), device=resets.device).unsqueeze(1)
     start = torch.where(resets, time, -1).cummax(0).values
-    return torch.where(start < 0, time + before.squeeze(1), time - start).float().unsqueeze(2)
+    return torch.where(start < 0, time + before.squeeze(1), time - start).to(before.dtype).unsqueeze(2)

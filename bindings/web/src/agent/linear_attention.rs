@@ -8,9 +8,6 @@
 
 use endless_gym_kernels::functions::sigmoid;
 
-/// Added to the mean square by which vectors are normalised.
-const EPSILON: f32 = 1e-5;
-
 /// Steps of a convolution.
 const WINDOW: usize = 4;
 
@@ -33,9 +30,11 @@ pub struct Sizes {
     pub inner: usize,
     /// K, the size of a key.
     pub keys: usize,
+    /// Size of the feed-forward network; 0 if there is none.
+    pub feed_forward: usize,
 }
 
-/// Residual layers x + layer(norm(x)), one after the other, and a last normalisation.
+/// Residual layers x + layer(norm(x)), each followed by y + feed_forward(norm(y)), and a last normalisation.
 pub struct Stack {
     kind: Kind,
     sizes: Sizes,
@@ -52,8 +51,10 @@ struct Layer {
     a_log: Vec<f32>,
     dt_bias: Vec<f32>,
     d: Vec<f32>,
+    gamma: Vec<f32>,
     inner_norm: Vec<f32>,
     leave: Vec<f32>,
+    feed_forward: [Vec<f32>; 3],
 }
 
 /// State of a layer.
@@ -79,19 +80,18 @@ impl Stack {
         sizes: Sizes,
         mut weights: impl FnMut(String, &[usize]) -> Result<Vec<f32>, E>,
     ) -> Result<Self, E> {
-        let Sizes { width, heads, inner, keys } = sizes;
+        let Sizes { width, heads, inner, keys, feed_forward } = sizes;
         let convolved = match kind {
-            Kind::GatedDeltaNet => 3 * width,
+            Kind::GatedDeltaNet | Kind::RetNet => 2 * heads * keys + inner,
             Kind::Mamba2 => inner + 2 * keys,
+        };
+        let numbers = match kind {
+            Kind::GatedDeltaNet => 2 * heads,
+            Kind::Mamba2 => heads,
             Kind::RetNet => 0,
         };
-        let entered = match kind {
-            Kind::GatedDeltaNet => 4 * width + 2 * heads,
-            Kind::Mamba2 => inner + convolved + heads,
-            Kind::RetNet => 4 * width,
-        };
-        let normalised = if kind == Kind::Mamba2 { inner } else { inner / heads };
-        let (gated, mamba) = (kind != Kind::RetNet, kind == Kind::Mamba2);
+        let (retnet, mamba) = (kind == Kind::RetNet, kind == Kind::Mamba2);
+        let normalised = if mamba { inner } else { inner / heads };
         let layer = |i: usize| {
             let mut tensor = |exists: bool, name: &str, shape: &[usize]| {
                 if exists { weights(format!("memory.cell.{name}"), shape) } else { Ok(Vec::new()) }
@@ -99,14 +99,24 @@ impl Stack {
             let of = |name: &str| format!("layers.{i}.{name}");
             Ok(Layer {
                 norm: tensor(true, &format!("norms.{i}.weight"), &[width])?,
-                enter: tensor(true, &of("enter.weight"), &[entered, width])?,
-                convolution: tensor(gated, &of("convolution.weight"), &[WINDOW, convolved])?,
-                convolution_bias: tensor(gated, &of("convolution.bias"), &[convolved])?,
-                a_log: tensor(gated, &of("a_log"), &[heads])?,
-                dt_bias: tensor(gated, &of("dt_bias"), &[heads])?,
+                enter: tensor(true, &of("enter.weight"), &[convolved + inner + numbers, width])?,
+                convolution: tensor(!retnet, &of("convolution.weight"), &[WINDOW, convolved])?,
+                convolution_bias: tensor(mamba, &of("convolution.bias"), &[convolved])?,
+                a_log: tensor(!retnet, &of("a_log"), &[heads])?,
+                dt_bias: tensor(!retnet, &of("dt_bias"), &[heads])?,
                 d: tensor(mamba, &of("d"), &[heads])?,
-                inner_norm: tensor(true, &of("norm.weight"), &[normalised])?,
+                gamma: tensor(retnet, &of("gamma"), &[heads])?,
+                inner_norm: if retnet {
+                    vec![1.0; normalised]
+                } else {
+                    tensor(true, &of("norm.weight"), &[normalised])?
+                },
                 leave: tensor(true, &of("leave.weight"), &[width, inner])?,
+                feed_forward: [
+                    tensor(feed_forward > 0, &of("feed_forward.norm.weight"), &[width])?,
+                    tensor(feed_forward > 0, &of("feed_forward.enter.weight"), &[2 * feed_forward, width])?,
+                    tensor(feed_forward > 0, &of("feed_forward.leave.weight"), &[width, feed_forward])?,
+                ],
             })
         };
         let layers = (0..layers).map(layer).collect::<Result<Vec<_>, E>>()?;
@@ -119,7 +129,7 @@ impl Stack {
         let Sizes { inner, keys, .. } = self.sizes;
         let state = |layer: &Layer| State {
             s: vec![0.0; keys * inner],
-            window: vec![0.0; (WINDOW - 1) * layer.convolution_bias.len()],
+            window: vec![0.0; layer.convolution.len() / WINDOW * (WINDOW - 1)],
             steps: 0.0,
         };
         self.layers.iter().map(state).collect()
@@ -129,22 +139,46 @@ impl Stack {
     pub fn step(&self, x: &[f32], states: &mut [State]) -> Vec<f32> {
         let mut x = x.to_vec();
         for (layer, state) in self.layers.iter().zip(states) {
-            let y = self.layer(layer, &normalised(&x, &layer.norm), state);
+            let y = self.layer(layer, &self.normalised(&x, &layer.norm), state);
             x.iter_mut().zip(y).for_each(|(x, y)| *x += y);
+            if self.sizes.feed_forward > 0 {
+                let y = self.feed_forward(layer, &x);
+                x.iter_mut().zip(y).for_each(|(x, y)| *x += y);
+            }
         }
-        normalised(&x, &self.norm)
+        self.normalised(&x, &self.norm)
+    }
+
+    /// The outputs of a layer's feed-forward network.
+    fn feed_forward(&self, layer: &Layer, x: &[f32]) -> Vec<f32> {
+        let [norm, enter, leave] = &layer.feed_forward;
+        let activation = if self.kind == Kind::RetNet { gelu } else { silu };
+        let entered = product(enter, &self.normalised(x, norm));
+        let (one, other) = entered.split_at(self.sizes.feed_forward);
+        let gated: Vec<f32> = one.iter().zip(other).map(|(one, other)| activation(*one) * other).collect();
+        product(leave, &gated)
+    }
+
+    /// RMSNorm (arXiv:1910.07467): x / sqrt(mean(x^2) + epsilon) * weight.
+    fn normalised(&self, x: &[f32], weight: &[f32]) -> Vec<f32> {
+        let epsilon = if self.kind == Kind::RetNet { 1e-6 } else { 1e-5 };
+        let mean = x.iter().map(|x| x * x).sum::<f32>() / x.len() as f32;
+        let scale = 1.0 / (mean + epsilon).sqrt();
+        x.iter().zip(weight).map(|(x, weight)| x * scale * weight).collect()
     }
 
     /// The outputs of a layer for its normalised inputs, and its state after the step.
     fn layer(&self, layer: &Layer, x: &[f32], state: &mut State) -> Vec<f32> {
-        let Sizes { width, heads, inner, keys } = self.sizes;
+        let Sizes { heads, inner, keys, .. } = self.sizes;
         let entered = product(&layer.enter, x);
         // Where the output gate is in `entered`; queries, keys and values of all heads; where the inputs of decays and rates are.
         let (gate, mut q, mut k, mut v, numbers) = match self.kind {
             Kind::GatedDeltaNet => {
-                let convolved = convolution(layer, &entered[..3 * width], &mut state.window);
-                let [q, k, v] = [0, 1, 2].map(|part| convolved[part * width..][..width].to_vec());
-                (3 * width..4 * width, q, k, v, 4 * width..entered.len())
+                let gate = 2 * heads * keys + inner;
+                let convolved = convolution(layer, &entered[..gate], &mut state.window);
+                let (qk, v) = convolved.split_at(gate - inner);
+                let (q, k) = qk.split_at(heads * keys);
+                (gate..gate + inner, q.to_vec(), k.to_vec(), v.to_vec(), gate + inner..entered.len())
             }
             Kind::Mamba2 => {
                 let convolved = convolution(layer, &entered[inner..entered.len() - heads], &mut state.window);
@@ -153,8 +187,9 @@ impl Stack {
                 (0..inner, q.repeat(heads), k.repeat(heads), v.to_vec(), entered.len() - heads..entered.len())
             }
             Kind::RetNet => {
-                let [q, k, v] = [0, 1, 2].map(|part| entered[part * width..][..width].to_vec());
-                (3 * width..4 * width, q, k, v, 0..0)
+                let (qk, vg) = entered.split_at(2 * heads * keys);
+                let (q, k) = qk.split_at(heads * keys);
+                (qk.len() + inner..entered.len(), q.to_vec(), k.to_vec(), vg[..inner].to_vec(), 0..0)
             }
         };
         let mut y = vec![0.0; inner];
@@ -163,9 +198,11 @@ impl Stack {
             let (q, k) = (&mut q[part(keys)], &mut k[part(keys)]);
             let (v, y) = (&mut v[part(inner / heads)], &mut y[part(inner / heads)]);
             let s = &mut state.s[part(keys * inner / heads)];
+            let scale = (keys as f32).powf(-0.5);
             match self.kind {
                 Kind::GatedDeltaNet => {
                     [&mut *q, &mut *k].into_iter().for_each(unit);
+                    q.iter_mut().for_each(|q| *q *= scale);
                     let [a, b] = [0, heads].map(|offset| entered[numbers.start + offset + head]);
                     let decay = (-layer.a_log[head].exp() * softplus(a + layer.dt_bias[head])).exp();
                     attend(s, q, k, v, decay, Some(sigmoid(b)), y);
@@ -178,10 +215,12 @@ impl Stack {
                     y.iter_mut().zip(direct).for_each(|(y, direct)| *y += direct);
                 }
                 Kind::RetNet => {
-                    let scale = (keys as f32).powf(-0.5);
+                    let gamma = layer.gamma[head];
                     k.iter_mut().for_each(|k| *k *= scale);
                     [&mut *q, &mut *k].into_iter().for_each(|x| rotate(x, state.steps));
-                    attend(s, q, k, v, 1.0 - (-5.0 - head as f32).exp2(), None, y);
+                    attend(s, q, k, v, gamma, None, y);
+                    let powers = (1.0 - gamma.powf(state.steps + 1.0)) / (1.0 - gamma);
+                    y.iter_mut().for_each(|y| *y /= powers.sqrt());
                 }
             }
         }
@@ -189,9 +228,9 @@ impl Stack {
         let gate = entered[gate].iter().map(|x| silu(*x));
         if self.kind == Kind::Mamba2 {
             y.iter_mut().zip(gate).for_each(|(y, gate)| *y *= gate);
-            y = normalised(&y, &layer.inner_norm);
+            y = self.normalised(&y, &layer.inner_norm);
         } else {
-            y = y.chunks(inner / heads).flat_map(|y| normalised(y, &layer.inner_norm)).collect();
+            y = y.chunks(inner / heads).flat_map(|y| self.normalised(y, &layer.inner_norm)).collect();
             y.iter_mut().zip(gate).for_each(|(y, gate)| *y *= gate);
         }
         product(&layer.leave, &y)
@@ -217,7 +256,7 @@ fn convolution(layer: &Layer, x: &[f32], window: &mut Vec<f32>) -> Vec<f32> {
     let y = (0..x.len()).map(|channel| {
         let past = (0..WINDOW)
             .map(|j| layer.convolution[j * x.len() + channel] * window[(WINDOW - 1 - j) * x.len() + channel]);
-        silu(layer.convolution_bias[channel] + past.sum::<f32>())
+        silu(layer.convolution_bias.get(channel).unwrap_or(&0.0) + past.sum::<f32>())
     });
     let y = y.collect();
     window.drain(..x.len());
@@ -229,30 +268,28 @@ fn product(weight: &[f32], x: &[f32]) -> Vec<f32> {
     weight.chunks(x.len()).map(|row| row.iter().zip(x).map(|(w, x)| w * x).sum()).collect()
 }
 
-/// RMSNorm (arXiv:1910.07467): x / sqrt(mean(x^2) + EPSILON) * weight.
-fn normalised(x: &[f32], weight: &[f32]) -> Vec<f32> {
-    let mean = x.iter().map(|x| x * x).sum::<f32>() / x.len() as f32;
-    let scale = 1.0 / (mean + EPSILON).sqrt();
-    x.iter().zip(weight).map(|(x, weight)| x * scale * weight).collect()
-}
-
-/// Divides by the length, as `torch.nn.functional.normalize`.
+/// Divides by the length.
 fn unit(x: &mut [f32]) {
-    let length = x.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-12);
+    let length = (x.iter().map(|x| x * x).sum::<f32>() + 1e-6).sqrt();
     x.iter_mut().for_each(|x| *x /= length);
 }
 
-/// Rotates the pairs of entries i and i + n by n angles.
+/// Rotates the pairs of entries i and i + n by n angles, `step` times 1 to 10^-4.
 fn rotate(x: &mut [f32], step: f32) {
     let half = x.len() / 2;
     for i in 0..half {
-        let (sine, cosine) = (step * 10_000_f32.powf(-(i as f32) / half as f32)).sin_cos();
+        let part = i as f32 / (half - 1).max(1) as f32;
+        let (sine, cosine) = (step * 10_000_f32.powf(-part)).sin_cos();
         (x[i], x[half + i]) = (x[i] * cosine - x[half + i] * sine, x[half + i] * cosine + x[i] * sine);
     }
 }
 
 fn silu(x: f32) -> f32 {
     x * sigmoid(x)
+}
+
+fn gelu(x: f32) -> f32 {
+    0.5 * x * (1.0 + libm::erff(x * std::f32::consts::FRAC_1_SQRT_2))
 }
 
 /// log(1 + exp(x)).

@@ -226,20 +226,21 @@ fn network_spec(settings: &Settings, tensors: &SafeTensors) -> Result<NetworkSpe
 fn stack(kind: Kind, spec: &NetworkSpec, tensors: &SafeTensors) -> Result<Stack, AgentFileError> {
     let layers = count(tensors, |layer| format!("memory.cell.layers.{layer}.enter.weight"));
     let size = |name: &str, axis: usize| size(tensors, &format!("memory.cell.layers.0.{name}"), axis);
-    let width = spec.hidden_size;
-    let (heads, inner, keys) = match kind {
-        Kind::GatedDeltaNet => (size("a_log", 0)?, width, width / size("a_log", 0)?),
-        Kind::RetNet => (width / size("norm.weight", 0)?, width, size("norm.weight", 0)?),
-        Kind::Mamba2 => {
-            let inner = size("leave.weight", 1)?;
-            (size("a_log", 0)?, inner, size("convolution.bias", 0)?.saturating_sub(inner) / 2)
-        }
+    let (width, inner) = (spec.hidden_size, size("leave.weight", 1)?);
+    let heads = size(if kind == Kind::RetNet { "gamma" } else { "a_log" }, 0)?;
+    let keys = match kind {
+        Kind::GatedDeltaNet => size("convolution.weight", 1)?.saturating_sub(inner) / (2 * heads),
+        Kind::Mamba2 => size("convolution.weight", 1)?.saturating_sub(inner) / 2,
+        Kind::RetNet => width / heads,
     };
+    let feed_forward = if kind == Kind::Mamba2 { 0 } else { size("feed_forward.leave.weight", 1)? };
     let inputs = if spec.embedding { width } else { spec.encoder_width };
     if keys == 0 || heads == 0 || inner % heads != 0 || inputs != width {
         return Err(AgentFileError::Heads { heads, channels: inner, width, given: inputs });
     }
-    Stack::new(kind, layers, Sizes { width, heads, inner, keys }, |name, shape| weights(tensors, &name, shape))
+    Stack::new(kind, layers, Sizes { width, heads, inner, keys, feed_forward }, |name, shape| {
+        weights(tensors, &name, shape)
+    })
 }
 
 /// The weights of a tensor.

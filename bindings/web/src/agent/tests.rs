@@ -256,11 +256,11 @@ fn layers_that_do_not_fit_are_refused() {
         let error = Agent::read(&wide).map(drop).unwrap_err();
         assert!(matches!(error, AgentFileError::Heads { width: 12, given: 24, .. }), "{error}");
     }
-    // Five heads for 12 channels, in tensors that agree.
+    // Five heads for 16 channels, in tensors that agree.
     let file = std::fs::read("tests/agents/gated-deltanet.safetensors").unwrap();
     let [a_log, dt_bias, enter] =
         ["a_log", "dt_bias", "enter.weight"].map(|part| format!("memory.cell.layers.0.{part}"));
-    let five = reshaped(&file, &[(&a_log, &[5]), (&dt_bias, &[5]), (&enter, &[4 * 12 + 10, 12])]);
+    let five = reshaped(&file, &[(&a_log, &[5]), (&dt_bias, &[5]), (&enter, &[32 + 16 + 10, 12])]);
     let error = Agent::read(&five).map(drop).unwrap_err();
-    assert!(matches!(error, AgentFileError::Heads { heads: 5, channels: 12, .. }), "{error}");
+    assert!(matches!(error, AgentFileError::Heads { heads: 5, channels: 16, .. }), "{error}");
 }

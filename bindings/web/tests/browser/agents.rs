@@ -178,7 +178,7 @@ fn an_agent_of_a_file_plays() {
         browser.choose("#file", &file);
     };
     open(&mut browser, "success", b'.');
-    browser.wait("document.getElementById('trained').textContent.endsWith('steps; its mean return is 0.02 with command count 1; its mean return is 0.03 with command count 2.')");
+    browser.wait("document.getElementById('trained').textContent.endsWith('steps; its mean return is 0.02 with command count 1; its mean return is 0.02 with command count 2.')");
     open(&mut browser, ID, b'9');
     browser.wait(
         "document.getElementById('message').textContent.endsWith('MortarMayhem-Grid-v9, which is not on this page')",
