@@ -108,6 +108,8 @@ class Recurrence:
     """residual connection around the recurrent layers"""
     embedding: bool = True
     """fully connected layer before the recurrent layers"""
+    forget_bias: Finite = 0.0
+    """initial bias of the forget gates of the agent lstm; with 1, it forgets less at first"""
     sequence_length: Positive = 512
     """length of truncated BPTT in steps; longer segments are cut into sequences that start from stored states"""
     kernels: Literal["auto", "torch"] = "auto"

@@ -13,12 +13,15 @@ import pytest
 from endless_gym_agents.evaluation import conformance
 from endless_gym_agents.memories import MEMORIES
 
+OPTIONS = ("mingru positive=true", "shm stride=0 limit=100")
 
-@pytest.mark.parametrize("name", ["gru", "lstm", "trxl", "gtrxl", *MEMORIES])
-def test_the_memories_of_the_package_pass(name: str) -> None:
+
+@pytest.mark.parametrize("given", ["gru", "lstm", "trxl", "gtrxl", *MEMORIES, *OPTIONS])
+def test_the_memories_of_the_package_pass(given: str) -> None:
+    name, *options = given.split()
     # The cache of a transformer is as long as its window, so fewer steps suffice.
     results = list(
-        conformance.check(name, steps=500 if "trxl" in name else 1000, long=500 if "trxl" in name else 10_000)
+        conformance.check(name, tuple(options), 500 if "trxl" in name else 1000, 500 if "trxl" in name else 10_000)
     )
     assert [result.name for result in results if not result.passed] == []
     names = {result.name for result in results}

@@ -146,6 +146,9 @@ def test_agents_that_the_page_cannot_compute_are_refused(tmp_path: Path) -> None
     run = trained(tmp_path, agent="lstm")
     with pytest.raises(ValueError, match="--agent must be gru, mingru, gated-deltanet, mamba2, retnet, none, got lstm"):
         export.execute(export.ExportArguments(run, out=tmp_path / "agent.safetensors"))
+    run = trained(tmp_path / "positive", agent="mingru", agent_option=("positive=true",))
+    with pytest.raises(ValueError, match="mingru must have no --agent-option, got positive=true"):
+        export.execute(export.ExportArguments(run, out=tmp_path / "agent.safetensors"))
 
 
 def test_what_is_read_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

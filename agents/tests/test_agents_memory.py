@@ -27,6 +27,7 @@ KINDS = {
     "lstm without embedding": ("lstm", {"recurrence": Recurrence(16, embedding=False, sequence_length=24)}),
     "mingru": ("mingru", {}),
     "mingru, two layers": ("mingru", {"recurrence": Recurrence(16, layers=2, sequence_length=8)}),
+    "mingru, positive": ("mingru", {"agent_option": ("positive=true",)}),
     "mingru, PyTorch's operations": ("mingru", {"recurrence": Recurrence(16, sequence_length=8, kernels="torch")}),
     "trxl": ("trxl", {}),
     "trxl, full heads": ("trxl", transformer(shared_heads=False)),

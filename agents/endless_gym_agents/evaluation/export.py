@@ -112,6 +112,7 @@ def check(settings: Settings, agent: Agent) -> None:
     """
     wrong = {
         f"--agent must be {', '.join(PAGE_AGENTS)}": settings.agent not in PAGE_AGENTS and settings.agent,
+        "mingru must have no --agent-option": settings.agent == "mingru" and " ".join(settings.agent_option),
         "--encoder must be the package's": settings.encoder,
         "--environment.wrapper must be empty": " ".join(settings.environment.own_wrappers),
         "the observation must be `features` alone": list(agent.observation_shapes) != ["features"]

@@ -5,12 +5,14 @@ m traces and c contexts:
 
     x~_t = (W_1 u_t) * sigmoid(W_2 u_t)                             gated input, (m)
     S_t = gamma * S_{t-1} + x~_t 1^T                                state, complex (m, c)
-    gamma = exp(-|a|) exp(i b)^T                                    a (m), b (c), learnt
+    gamma = exp(-a) exp(i b)^T                                      a (m), b (c), learnt
     z_t = W_3 (Re S_t, Im S_t)
     y_t = LayerNorm(z_t) * g_t + (W_4 u_t) * (1 - g_t),   g_t = sigmoid(W_5 u_t)
 
-At initialisation, the slowest trace decays to 1 % and the slowest context turns once in `longest` = 1024 steps, as in the
-paper's code. Its closed form needs powers of 1 / gamma in double precision; the scan here does not.
+Initial values and limits of a are those of the authors' code (proroklab/ffm, `standalone/ffm`), whose a has the other sign:
+the slowest trace decays to 1 % and the slowest context turns once in `longest` = 1024 steps, and the fastest trace has the
+factor 0.51. The code needs powers of 1 / gamma in double precision, which limits a; the scan here does not, and has the same
+limits.
 """
 
 from __future__ import annotations
@@ -33,18 +35,19 @@ class FFM(SequenceModel):
         self.width, self.state_shapes = width, dict.fromkeys(("real", "imaginary"), (traces, contexts))
         self.parts = [traces, traces, width, width]
         self.enter = nn.Linear(input_width, sum(self.parts))
-        # The fastest decay is that of the paper's code in double precision.
-        fastest = math.log(torch.finfo(torch.float64).max) / longest
-        self.a = nn.Parameter(torch.linspace(fastest, -math.log(0.01) / longest, traces))
+        self.fastest = math.log(torch.finfo(torch.float64).max) / longest - 0.01
+        self.a = nn.Parameter(torch.linspace(self.fastest - 0.01, -math.log(0.01) / longest, traces))
         self.b = nn.Parameter(2 * math.pi / torch.linspace(1, longest, contexts))
+        for decays in (self.a, self.b):
+            decays._no_weight_decay = True  # type: ignore[attr-defined]
         self.mix = nn.Linear(2 * traces * contexts, width)
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
 
     def gamma(self) -> Tensor:
         """gamma, complex64 (m, c); no entry grows."""
-        return torch.polar(
-            torch.exp(-self.a.abs()).unsqueeze(1).expand(-1, len(self.b)), self.b.expand(len(self.a), -1)
-        )
+        with torch.no_grad():
+            self.a.clamp_(1e-8, self.fastest)
+        return torch.polar(torch.exp(-self.a).unsqueeze(1).expand(-1, len(self.b)), self.b.expand(len(self.a), -1))
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The gated input as complex64 (..., m, c), the part that skips the memory, and the gate g."""

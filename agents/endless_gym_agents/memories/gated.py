@@ -90,6 +90,12 @@ class LSTM(_Gated, nn.LSTM):
 
     parts = ("h", "c")
 
+    def __init__(self, input_width: int, width: int, layers: int, forget_bias: float = 0.0) -> None:
+        """Make the layers with an initial bias of the forget gates (Jozefowicz et al., 2015, recommend 1)."""
+        super().__init__(input_width, width, layers)
+        for _, _, bias, _ in self.all_weights:
+            bias.data[width : 2 * width] = forget_bias
+
     def cell(self, x: Tensor, state: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
         return torch.lstm_cell(x, list(state), *weights)
 

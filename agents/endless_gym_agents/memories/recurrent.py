@@ -89,9 +89,8 @@ class RecurrentMemory(Memory[RecurrentState, State, RecurrentMinibatch]):
         inputs = settings.hidden_size if settings.embedding else input_width
         # Files of agents have the names of these attributes.
         if isinstance(kind, str):
-            self.recurrent: SequenceModel = (LSTM if kind == "lstm" else GRU)(
-                inputs, settings.hidden_size, settings.layers
-            )
+            sizes = inputs, settings.hidden_size, settings.layers
+            self.recurrent: SequenceModel = LSTM(*sizes, settings.forget_bias) if kind == "lstm" else GRU(*sizes)
         else:
             self.cell = _layers(kind, inputs, settings, options or {})
         self.width = self.model.width
