@@ -200,6 +200,9 @@ class PPO:
     """initial learning rate of AdamW"""
     final_learning_rate: FromZero = 1.0e-5
     """learning rate after its decay"""
+    weight_decay: Literal["all", "matrices"] = "all"
+    """weights that AdamW decays by 0.01 times the learning rate. all: all, as in the authors' trainer; matrices: neither biases
+    nor the gains of norms. Those that a memory excludes, such as its rates of decay, never do"""
     entropy_coefficient: FromZero = 1.0e-4
     """initial coefficient of the entropy bonus"""
     final_entropy_coefficient: FromZero = 1.0e-6
@@ -489,6 +492,7 @@ def _presets() -> dict[str, Settings]:
             "advantage_normalisation": "minibatch",
             "learning_rate": 1.0e-3,
             "final_learning_rate": 1.0e-4,
+            "weight_decay": "matrices",
             "entropy_coefficient": 1.0e-2,
             "final_entropy_coefficient": 1.0e-3,
             "max_gradient_norm": 0.5,

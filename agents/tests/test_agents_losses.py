@@ -11,9 +11,9 @@ from operations import Operations
 from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.agent.encoders import FRAME
 from endless_gym_agents.memories.memory import MemoryState, Minibatch
-from endless_gym_agents.settings import PPO
+from endless_gym_agents.settings import PPO, PRESETS
 from endless_gym_agents.training import losses
-from endless_gym_agents.training.ppo import learn, linear_decay, minibatch_loss
+from endless_gym_agents.training.ppo import learn, learning_rate_factor, linear_decay, make_optimizer, minibatch_loss
 from endless_gym_agents.training.rollout import Segment
 
 GAMMA, LAMBDA = 0.9, 0.8
@@ -174,3 +174,46 @@ def test_batch_normalisation_is_over_the_whole_segment() -> None:
     torch.testing.assert_close(results["batch", 1], results["minibatch", 1])
     assert not torch.allclose(results["batch", 4], results["minibatch", 4])
     assert not torch.allclose(results["batch", 1], results["none", 1])
+
+
+def test_the_presets_of_the_paper_decay_all_weights_as_its_authors_do() -> None:
+    """neroRL (commit 0057ee4) makes AdamW of all parameters, with PyTorch's defaults."""
+    for name in ("paper", "old", "overnight"):
+        for kind in ("gru", "trxl", "gtrxl"):
+            agent = make(kind, ppo={"weight_decay": PRESETS[name].ppo.weight_decay})
+            (group,) = make_optimizer(agent, 1e-3).param_groups
+            assert group["params"] == list(agent.parameters())
+            assert group["weight_decay"] == torch.optim.AdamW(agent.parameters()).defaults["weight_decay"] == 0.01
+
+
+@pytest.mark.parametrize("decayed", ["all", "matrices"])
+def test_biases_norms_and_marked_weights_do_not_decay(decayed: str) -> None:
+    agent = make("ffm", ppo={"weight_decay": decayed})
+    mixing = agent.get_parameter("memory.cell.layers.0.mix.weight")
+    mixing._learning_rate_factor = 0.25  # type: ignore[attr-defined]
+    optimizer = make_optimizer(agent, 0.1)
+    before = {name: weight.detach().clone() for name, weight in agent.named_parameters()}
+    # With a gradient of 0, a step is the decay alone.
+    sum(weight.sum() for weight in agent.parameters()).mul(0).backward()
+    for group in optimizer.param_groups:
+        group["lr"] = 0.1 * learning_rate_factor(group["params"][0])
+    optimizer.step()
+    for name, weight in agent.named_parameters():
+        is_marked = name in ("memory.cell.layers.0.a", "memory.cell.layers.0.b")
+        decays = not is_marked and (decayed == "all" or weight.dim() > 1)
+        rate = 0.1 * (0.25 if weight is mixing else 1.0)
+        expected = before[name] * (1 - rate * 0.01 if decays else 1.0)
+        torch.testing.assert_close(weight.detach(), expected, rtol=1e-6, atol=0, msg=name)
+
+
+def test_a_factor_multiplies_the_learning_rate() -> None:
+    agent, segment, state = played("ffm")
+    mixing = agent.get_parameter("memory.cell.layers.0.mix.weight")
+    mixing._learning_rate_factor = 0.25  # type: ignore[attr-defined]
+    optimizer, before = make_optimizer(agent, 1.0), [weight.detach().clone() for weight in agent.parameters()]
+    ppo = PPO(epochs=1, minibatches=1, steps=16, learning_rate=1e-3)
+    learn(agent, optimizer, segment, [state], 0, ppo, torch.Generator().manual_seed(0))
+    for (name, weight), old in zip(agent.named_parameters(), before, strict=True):
+        # The first step of AdamW is as long as the learning rate.
+        expected = 1e-3 * (0.25 if weight is mixing else 1.0)
+        assert float((weight - old).abs().max()) == pytest.approx(expected, rel=0.05), name

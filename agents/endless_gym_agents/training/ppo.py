@@ -28,9 +28,27 @@ def linear_decay(initial: float, final: float, update: int, decay_updates: int) 
 
 
 def make_optimizer(agent: Agent, learning_rate: float) -> torch.optim.AdamW:
-    """AdamW with PyTorch's default coefficients, fused where PyTorch supports it."""
-    fused = agent.device.type in ("cpu", "cuda")
-    return torch.optim.AdamW(agent.parameters(), lr=learning_rate, fused=fused)
+    """AdamW with PyTorch's default coefficients, fused where PyTorch supports it.
+
+    `PPO.weight_decay` says which weights decay. A memory sets attributes of parameters: with `_no_weight_decay = True` one never
+    decays, and `_learning_rate_factor = x` multiplies its learning rate.
+    """
+    groups: dict[tuple[float, float], list[nn.Parameter]] = {}
+    for name, parameter in agent.named_parameters():
+        is_matrix = parameter.dim() > 1 and not name.endswith("bias")
+        decays = agent.settings.ppo.weight_decay == "all" or is_matrix
+        decay = 0.01 if decays and not getattr(parameter, "_no_weight_decay", False) else 0.0
+        groups.setdefault((decay, learning_rate_factor(parameter)), []).append(parameter)
+    return torch.optim.AdamW(
+        [{"params": each, "weight_decay": decay} for (decay, _), each in groups.items()],
+        lr=learning_rate,
+        fused=agent.device.type in ("cpu", "cuda"),
+    )
+
+
+def learning_rate_factor(parameter: nn.Parameter) -> float:
+    """The factor of a parameter's learning rate; the same for all of a group of `make_optimizer`."""
+    return getattr(parameter, "_learning_rate_factor", 1.0)
 
 
 def minibatch_loss(
@@ -126,7 +144,7 @@ def learn(
         settings.entropy_coefficient, settings.final_entropy_coefficient, update, settings.decay_updates
     )
     for group in optimizer.param_groups:
-        group["lr"] = learning_rate
+        group["lr"] = learning_rate * learning_rate_factor(group["params"][0])
     ranks = ranks or Ranks()
     own_advantages = losses.generalised_advantages(
         segment.reward, segment.value, segment.done, segment.last_value, settings.gamma, settings.gae_lambda

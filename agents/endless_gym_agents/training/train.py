@@ -31,7 +31,7 @@ from endless_gym_agents.common import atomic, command
 from endless_gym_agents.common.clock import Clock
 from endless_gym_agents.environments.groups import Environments
 from endless_gym_agents.environments.ranks import Ranks
-from endless_gym_agents.settings import PRESETS, Settings, to_dict
+from endless_gym_agents.settings import PRESETS, Settings, to_dict, value
 from endless_gym_agents.training import checkpoint, run_folder
 from endless_gym_agents.training.logs import RECENT, Logger, SilentLogger, learnt, means
 from endless_gym_agents.training.ppo import Diverged, learn, make_optimizer
@@ -282,13 +282,14 @@ def check_resumable(settings: Settings, before: Settings) -> None:
     Raises:
         ValueError: A setting that must not change differs.
     """
-    # The engine and its threads may change, and so may all of PPO except whether the auxiliary heads exist.
+    # The engine and its threads may change, and so may all of PPO except what decays and whether the auxiliary heads exist.
     had = before.environment
     environment = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
     settings = dataclasses.replace(settings, environment=environment).resolved()
     own = ("agent", "agent_option", "encoder", "encoder_option")
-    for name in ("env", *own, "preset", "seed", "environment", "model", "recurrence", "transformer"):
-        for part, given, had in _parts(name, getattr(settings, name), getattr(before, name)):
+    groups = ("environment", "model", "recurrence", "transformer")
+    for name in ("env", *own, "preset", "seed", *groups, "ppo.weight_decay"):
+        for part, given, had in _parts(name, value(settings, name), value(before, name)):
             if given != had:
                 raise ValueError(
                     f"a resumed run must keep its {part}: expected {had}, got {given}; omit the flag, or start a new run"
