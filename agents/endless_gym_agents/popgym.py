@@ -37,7 +37,7 @@ class Vectors(PreviousAction):
 
 
 class OneHot(Vectors):
-    """Observations in which integers are one-hot, as those of `endless learn`."""
+    """Observations in which integers are one-hot, as those of `endless learn` before it added the previous action."""
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(envs, previous_action=False, antialias=False)

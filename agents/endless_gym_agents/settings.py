@@ -34,7 +34,7 @@ TRAINING_SEEDS = range(100_000)
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
 
-#: The wrapper in environments whose observations are not vectors, and what a run of `endless learn` observes there.
+#: The wrapper in environments whose observations are not vectors, and that of runs of `endless learn` whose settings have none.
 VECTORS, ONE_HOT = (f"endless_gym_agents.popgym:{name}" for name in ("Vectors", "OneHot"))
 
 

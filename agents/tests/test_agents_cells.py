@@ -13,7 +13,7 @@ from endless_gym_agents.settings import ONE_HOT, VECTORS, Settings, from_dict, t
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.train import parse, train
 
-#: The entries of the observations of `endless-train` and of `endless learn`.
+#: The entries of the observations, and those of earlier runs of `endless learn`.
 ENTRIES = {
     "popgym-RepeatPreviousEasy-v0": (4 + 4 + 2, 4),
     "popgym-AutoencodeEasy-v0": (2 + 4 + 4 + 2, 2 + 4),
@@ -27,7 +27,7 @@ ENTRIES = {
 def test_integers_become_vectors_without_a_flag(id: str) -> None:
     wanted = Settings(env=id).validated()
     given = to_dict(Settings(env=id))
-    # `endless learn` writes no wrapper.
+    # Earlier versions of `endless learn` wrote no wrapper.
     del given["environment"]["wrapper"]
     of_rust = from_dict(given)
     is_box = "CartPole" in id

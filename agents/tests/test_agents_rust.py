@@ -6,7 +6,7 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +15,10 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+from torch.nn import functional
 
 from endless_gym.specs import all_specs
 from endless_gym_agents.agent.agent import Agent
@@ -25,7 +27,15 @@ from endless_gym_agents.common.command import STOP_SIGNALS
 from endless_gym_agents.environments.groups import Environments
 from endless_gym_agents.evaluation import enjoy, export, plot, protocol, record
 from endless_gym_agents.evaluation.evaluate import evaluate
-from endless_gym_agents.settings import ONE_HOT, PAPER_STEPS_PER_UPDATE, PRESETS, Settings, paper_run_length, value
+from endless_gym_agents.settings import (
+    ONE_HOT,
+    PAPER_STEPS_PER_UPDATE,
+    PRESETS,
+    VECTORS,
+    Settings,
+    paper_run_length,
+    value,
+)
 from endless_gym_agents.training import checkpoint, ppo
 from endless_gym_agents.training.logs import read_progress
 from endless_gym_agents.training.rollout import RolloutCollector
@@ -57,11 +67,13 @@ def numbered(run: Path, update: int) -> checkpoint.Checkpoint:
     return checkpoint.load(run / "checkpoints" / f"update-{update:06d}.safetensors")
 
 
-def noise_of(seed: int, update: int, shape: tuple[int, ...]) -> Tensor:
-    """The Gumbel noise of an update, from the same uniform numbers."""
+def noise_of(seed: int, update: int, shape: tuple[int, ...], branches: Sequence[int]) -> Tensor:
+    """The Gumbel noise of an update, from the same uniform numbers, (*shape, branches, choices)."""
     sequence = np.random.SeedSequence(seed, spawn_key=(1, update))
-    uniform = np.random.Generator(np.random.PCG64(sequence)).random(shape, dtype=np.float32)
-    return torch.from_numpy(-np.log(-np.log(np.maximum(uniform, np.finfo(np.float32).tiny))))
+    uniform = np.random.Generator(np.random.PCG64(sequence)).random((*shape, sum(branches)), dtype=np.float32)
+    noise = torch.from_numpy(-np.log(-np.log(np.maximum(uniform, np.finfo(np.float32).tiny))))
+    parts = [functional.pad(part, (0, max(branches) - part.shape[-1])) for part in noise.split(list(branches), -1)]
+    return torch.stack(parts, -2)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +96,7 @@ def test_one_update_equals_that_of_the_python_agents(
     run = new_run(tmp_path / "run", f"{flags} --ppo.updates 1 --threads 2", env)
     before, after = numbered(run, 0), numbered(run, 1)
     settings, agent = before.settings, before.agent
-    monkeypatch.setattr(Agent, "noise", lambda self, shape, generator: noise_of(1, 0, (*shape, 1, agent.branches[0])))
+    monkeypatch.setattr(Agent, "noise", lambda self, shape, generator: noise_of(1, 0, shape, agent.branches))
     with Environments(settings) as environments:
         collector = RolloutCollector(agent, environments, settings.ppo.steps, torch.Generator())
         segment, ended = collector.collect(Clock())
@@ -102,6 +114,54 @@ def test_one_update_equals_that_of_the_python_agents(
     for name, weights in agent.state_dict().items():
         assert torch.allclose(after.agent.state_dict()[name], weights, rtol=0, atol=1e-4), name
         assert bool(weights.isfinite().all()), name
+
+
+@pytest.mark.parametrize("env", ["MultiarmedBanditEasy", "AutoencodeEasy", "BattleshipEasy", "MineSweeperEasy"])
+def test_both_trainers_observe_the_same_vectors(env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values, entropies and the actions that are chosen depend on all entries. Weights stay; the run is resumed in an episode."""
+    flags = "--ppo.steps 128 --ppo.learning-rate 0 --ppo.final-learning-rate 0 --ppo.epochs 1 --ppo.updates"
+    run = new_run(tmp_path / "run", f"{flags} 1", f"popgym-{env}-v0")
+    learn(f"--resume {run} --ppo.updates 3")
+    settings, agent, update, ends = numbered(run, 0).settings, numbered(run, 0).agent, 0, 0
+    assert settings.environment.wrapper == Settings(env=settings.env).validated().environment.wrapper == (VECTORS,)
+    monkeypatch.setattr(Agent, "noise", lambda self, shape, generator: noise_of(1, update, shape, agent.branches))
+    with Environments(settings) as environments:
+        collector, optimizer = (
+            RolloutCollector(agent, environments, 128, torch.Generator()),
+            ppo.make_optimizer(agent, 0.0),
+        )
+        for update, row in enumerate(read_progress(run)):
+            segment, ended = collector.collect(Clock())
+            ends += len(ended)
+            states = [memory.state for memory in collector.memories]
+            metrics = ppo.learn(agent, optimizer, segment, states, update, settings.ppo, torch.Generator())
+            for name in ("value", "entropy", "value_loss", "advantage", "gradient_norm"):
+                assert row[name] == pytest.approx(metrics[name], rel=1e-4, abs=1e-6), (update, name)
+    assert update == 2 and ends >= 8
+
+
+def test_a_run_without_the_previous_action_stays_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of an earlier version, whose settings have no wrapper."""
+    run = new_run(tmp_path / "run", f"--environment.wrapper {ONE_HOT} --ppo.updates 1", "popgym-AutoencodeEasy-v0")
+    through = new_run(
+        tmp_path / "through", f"--environment.wrapper {ONE_HOT} --ppo.updates 2", "popgym-AutoencodeEasy-v0"
+    )
+    given = json.loads((run / "settings.json").read_text())
+    assert given["environment"].pop("wrapper") == [ONE_HOT]
+    (run / "settings.json").write_text(json.dumps(given))
+    for file in (run / "checkpoints").iterdir():
+        with safe_open(file, "pt") as content:
+            header = json.loads(content.metadata()["endless"])
+        del header["settings"]["environment"]["wrapper"]
+        file.write_bytes(checkpoint.to_safetensors(load_file(file), header))
+    assert checkpoint.load(run).agent.observation_shapes == {"features": (6,)}
+    learn(f"--resume {run} --ppo.updates 2")
+    one, two = (checkpoint.load(each).agent for each in (run, through))
+    assert one.observation_shapes == {"features": (6,)}
+    assert all(torch.equal(weights, two.state_dict()[name]) for name, weights in one.state_dict().items())
+    assert "--environment.wrapper must be" in learn(
+        f"MortarMayhemB-Grid-v0 --environment.wrapper {VECTORS} --run {tmp_path / 'other'}", fails=True
+    )
 
 
 def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

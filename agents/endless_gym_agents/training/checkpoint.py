@@ -344,7 +344,7 @@ def to_safetensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any
 
 def _checksum(version: int, header: str, tensors: Mapping[str, torch.Tensor]) -> str:
     """As in the crate `endless-gym-kernels`, which defines it."""
-    names = {torch.float32: "F32", torch.uint8: "U8", torch.uint64: "U64"}
+    names = {torch.float32: "F32", torch.int32: "I32", torch.uint8: "U8", torch.uint64: "U64"}
     total = zlib.crc32(header.encode())
     for name, tensor in sorted(tensors.items()):
         described = f"{name} {names.get(tensor.dtype)} {list(tensor.shape)}" if version > 1 else name

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, file};
 use crate::metrics::Episode;
 use crate::rollout::State;
-use crate::settings::{Agent, Settings};
+use crate::settings::{Agent, Settings, VECTORS};
 use endless_gym_kernels::network::{Network, Tensor};
 
 /// Names in the folder of a run: the folder of the checkpoints, and the last checkpoint in it.
@@ -75,9 +75,13 @@ pub fn save(
         ("state/environments".to_owned(), Dtype::U8, vec![snapshots.len()], snapshots),
         ("state/lengths".to_owned(), Dtype::U64, vec![lengths.len()], bytemuck::cast_slice(&lengths).to_vec()),
     ];
+    let actions = (!state.actions.is_empty()).then(|| {
+        let shape = vec![starts.len(), state.actions.len() / starts.len()];
+        ("state/actions".to_owned(), Dtype::I32, shape, bytemuck::cast_slice(&state.actions).to_vec())
+    });
     let folder = run.join(FOLDER);
     let last = folder.join(LAST);
-    let tensors: Vec<_> = weights.chain(hidden).chain(others).collect();
+    let tensors: Vec<_> = weights.chain(hidden).chain(others).chain(actions).collect();
     let views = tensors
         .iter()
         .map(|(name, dtype, shape, bytes)| Ok((name.clone(), TensorView::new(*dtype, shape.clone(), bytes)?)));
@@ -237,7 +241,15 @@ impl Checkpoint {
         let mut rest = bytes.into_iter();
         let snapshots = lengths.iter().map(|length| rest.by_ref().take(*length as usize).collect()).collect();
         let starts = starts.iter().map(|start| *start != 0).collect();
-        Ok((header.update, header.steps, State { hidden, starts, episodes: header.episodes.into(), snapshots }))
+        let actions = match header.settings.environment.wrapper.iter().eq([VECTORS]) {
+            true => self.numbers(&tensors, "state/actions", Dtype::I32, &[num_envs, network.spec.choices.len()])?,
+            false => Vec::new(),
+        };
+        Ok((
+            header.update,
+            header.steps,
+            State { hidden, starts, actions, episodes: header.episodes.into(), snapshots },
+        ))
     }
 
     /// Copies weights into a new network; the encoder and the heads keep theirs where shapes differ. Returns a line of text that says

@@ -12,7 +12,7 @@ use endless_gym_service::{BatchLease, Trainer};
 
 use crate::error::Error;
 use crate::served;
-use crate::settings::{MAX_WIDTH, Settings};
+use crate::settings::{MAX_WIDTH, ONE_HOT, Settings, VECTORS};
 
 /// Seeds of the training episodes, as in the paper. Evaluation uses others, so its levels are never seen in training.
 const TRAINING_SEEDS: u64 = 100_000;
@@ -28,6 +28,8 @@ pub struct Environments {
     pub groups: usize,
     /// Environments in each group.
     pub per_group: usize,
+    /// `--environment.wrapper`, with its default.
+    pub wrapper: Vec<String>,
     place: Stepping,
 }
 
@@ -90,7 +92,7 @@ impl Environments {
         };
         let pools = (0..wanted.groups).map(pool).collect::<Result<Vec<_>, Error>>()?;
         let spec = registry.spec(&settings.env).map_err(PoolError::from)?.clone();
-        Ok(Self::new(spec, settings, Stepping::InProcess(pools)))
+        Self::new(spec, settings, Stepping::InProcess(pools))
     }
 
     /// The environments of an engine, as many as the settings say. The engine describes them, so the program need not have them.
@@ -114,12 +116,24 @@ impl Environments {
             return Err(Error::Settings(format!("the engine must serve {}, got {}", text(expected), text(given))));
         }
         let latest = (0..served.groups).map(|_| None).collect();
-        Ok(Self::new(spec, settings, Stepping::Served { trainer: Box::new(trainer), latest }))
+        Self::new(spec, settings, Stepping::Served { trainer: Box::new(trainer), latest })
     }
 
-    fn new(spec: EnvSpec, settings: &Settings, place: Stepping) -> Self {
+    fn new(spec: EnvSpec, settings: &Settings, place: Stepping) -> Result<Self, Error> {
         let wanted = &settings.environment;
-        Environments { spec, groups: wanted.groups, per_group: wanted.num_envs / wanted.groups, place }
+        let is_integers =
+            spec.observation_space.as_ref().is_some_and(|space| !matches!(space, ObservationSpace::Box { .. }));
+        let wrapper = match &wanted.wrapper[..] {
+            // Runs of versions without the previous action have no wrapper.
+            [] if is_integers && settings.resume.is_empty() => vec![VECTORS.to_owned()],
+            given @ ([] | [_]) if spec.vector_observation == 0 || given.is_empty() => given.to_vec(),
+            given => {
+                let rule =
+                    format!("--environment.wrapper must be {VECTORS} or {ONE_HOT}, once, and not for {}", spec.id);
+                return Err(Error::Settings(format!("{rule}, got {}", given.join(" "))));
+            }
+        };
+        Ok(Environments { spec, groups: wanted.groups, per_group: wanted.num_envs / wanted.groups, wrapper, place })
     }
 
     /// Number of choices of each branch of the action.
@@ -230,22 +244,46 @@ impl Environments {
         Ok(())
     }
 
-    /// Width of the observations that [`observe`](Self::observe) writes.
-    pub fn observation_width(&self) -> usize {
-        observation_width(&self.spec)
+    /// Whether observations include the previous action.
+    pub fn has_previous_action(&self) -> bool {
+        self.wrapper.iter().eq([VECTORS])
     }
 
-    /// Writes the last observations of a group, float32 (n, width): the features, then the vector observation. Integers of discrete
-    /// spaces are one-hot, since their numbers have no order in general.
-    pub fn observe(&self, group: usize, observations: &mut [f32]) {
+    /// Width of the observations that [`observe`](Self::observe) writes.
+    pub fn observation_width(&self) -> usize {
+        let added = if self.has_previous_action() { self.choices().iter().sum::<usize>() + 2 } else { 0 };
+        observation_width(&self.spec) + added
+    }
+
+    /// Writes the last observations of a group, float32 (n, width): the features, then the vector observation or, as POPGym's agents
+    /// observe them, the previous action and whether the step is the first of its episode. Integers of discrete spaces are one-hot,
+    /// since their numbers have no order in general.
+    ///
+    /// # Arguments
+    ///
+    /// - `group`: the group
+    /// - `starts`: whether each observation is the first of an episode, (n,)
+    /// - `actions`: the actions before them, (n, branches); empty without the previous action
+    pub fn observe(&self, group: usize, starts: &[bool], actions: &[i32], observations: &mut [f32]) {
         let Some(batch) = self.batch(group) else { return };
         let (features, vectors) = (self.spec.features.len(), self.spec.vector_observation);
+        let branches = self.spec.action_space.branches();
         for (env, row) in observations.chunks_exact_mut(self.observation_width()).enumerate() {
             let given = batch.features().get(env * features..(env + 1) * features).unwrap_or_default();
             let (row, vector) = row.split_at_mut(row.len() - vectors);
-            match &self.spec.observation_space {
-                Some(space) => drop(encode(space, given, row)),
-                None => row.copy_from_slice(given),
+            let rest = match &self.spec.observation_space {
+                Some(space) => encode(space, given, row).1,
+                None => {
+                    let (row, rest) = row.split_at_mut(features);
+                    row.copy_from_slice(given);
+                    rest
+                }
+            };
+            if self.has_previous_action() {
+                let is_first = starts[env];
+                let before = actions[env * branches.len()..].iter().map(|action| if is_first { 0 } else { *action });
+                let added = before.zip(branches.iter().copied()).chain([(i32::from(is_first), 2)]);
+                added.fold(rest, |rest, (number, choices)| one_hot(number as f32, choices, rest));
             }
             vector.copy_from_slice(
                 batch.vector_observation().get(env * vectors..(env + 1) * vectors).unwrap_or_default(),
@@ -268,16 +306,18 @@ fn encoded_width(space: &ObservationSpace) -> usize {
     }
 }
 
+/// Writes an integer as a one-hot vector, and returns the rest.
+fn one_hot(number: f32, choices: i32, to: &mut [f32]) -> &mut [f32] {
+    let (row, rest) = to.split_at_mut(choices as usize);
+    row.fill(0.0);
+    if let Some(entry) = row.get_mut(number as usize) {
+        *entry = 1.0;
+    }
+    rest
+}
+
 /// Writes the encoding of features, and returns the rest of both.
 fn encode<'a, 'b>(space: &ObservationSpace, features: &'a [f32], to: &'b mut [f32]) -> (&'a [f32], &'b mut [f32]) {
-    let one_hot = |number: f32, choices: i32, to: &'b mut [f32]| {
-        let (row, rest) = to.split_at_mut(choices as usize);
-        row.fill(0.0);
-        if let Some(entry) = row.get_mut(number as usize) {
-            *entry = 1.0;
-        }
-        rest
-    };
     match space {
         ObservationSpace::Discrete(n) => (&features[1..], one_hot(features[0], *n, to)),
         ObservationSpace::MultiDiscrete(numbers) => {

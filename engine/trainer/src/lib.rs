@@ -80,10 +80,11 @@ pub fn learn(
         checkpoint.check(&settings)?;
     }
     let is_new = resumed.is_none();
-    let kept = Settings { resume: String::new(), run: run.to_string_lossy().into_owned(), ..settings.clone() };
     let num_envs = settings.environment.num_envs;
     let (threads, started) = (Threads::new(settings.threads)?, Instant::now());
     let environments = environments(&settings)?;
+    let mut kept = Settings { resume: String::new(), run: run.to_string_lossy().into_owned(), ..settings.clone() };
+    kept.environment.wrapper.clone_from(&environments.wrapper);
     let mut random = generator(settings.seed, Purpose::Weights, 0);
     let mut network = network::new(&settings, environments.observation_width(), environments.choices(), &mut random);
     let mut learner = Learner::new(network.parameters.len());

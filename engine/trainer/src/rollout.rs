@@ -62,6 +62,8 @@ pub struct State {
     pub hidden: Vec<Vec<f32>>,
     /// Whether the next observation is the first of an episode, (N,).
     pub starts: Vec<bool>,
+    /// The last actions, (N, branches), if the next observations include them.
+    pub actions: Vec<i32>,
     /// The last episodes that ended, at most [`RECENT`].
     pub episodes: VecDeque<Episode>,
     /// Snapshots of the N environments.
@@ -111,12 +113,14 @@ impl Player {
             let envs = (0..count).map(|i| part(n, i, count)).map(|envs| group * n + envs.start..group * n + envs.end);
             parts.push(envs.map(|envs| Part { envs, pass: Pass::default() }).collect());
         }
+        let branches = if environments.has_previous_action() { network.spec.choices.len() } else { 0 };
         Ok(Player {
             environments,
             segment: Segment::default(),
             state: State {
                 hidden: vec![vec![0.0; num_envs * network.spec.hidden_size]; network.spec.layers],
                 starts: vec![true; num_envs],
+                actions: vec![0; num_envs * branches],
                 ..State::default()
             },
             steps: settings.ppo.steps,
@@ -227,6 +231,9 @@ impl Player {
         clock.inference += begin.elapsed();
         let begin = Instant::now();
         self.environments.send(group, &self.sent)?;
+        if let Some(actions) = self.state.actions.chunks_exact_mut(self.sent.len()).nth(group) {
+            actions.copy_from_slice(&self.sent);
+        }
         clock.stepping += begin.elapsed();
         let begin = Instant::now();
         for Part { envs, pass } in &self.parts[group] {
@@ -275,7 +282,9 @@ impl Player {
         let (first, width) = (group * self.environments.per_group, network.spec.observation_width);
         let (environments, hidden, starts) = (&self.environments, &self.state.hidden, &self.state.starts);
         let mut observations = vec![0.0; environments.per_group * width];
-        environments.observe(group, &mut observations);
+        let envs = first..first + environments.per_group;
+        let actions = self.state.actions.get(times(&envs, network.spec.choices.len())).unwrap_or_default();
+        environments.observe(group, &starts[envs], actions, &mut observations);
         threads.for_each(&mut self.parts[group], |_, Part { envs, pass }| {
             copy(&mut pass.observations, &observations[times(&(envs.start - first..envs.end - first), width)]);
             pass.states.resize_with(hidden.len(), Vec::new);

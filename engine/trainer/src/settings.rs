@@ -17,6 +17,11 @@ use serde_json::Value as Json;
 
 use crate::error::{Error, file};
 
+/// How observations become vectors, by the names of the Python agents' wrappers: with the previous action, or only one-hot.
+pub const VECTORS: &str = "endless_gym_agents.popgym:Vectors";
+/// See [`VECTORS`].
+pub const ONE_HOT: &str = "endless_gym_agents.popgym:OneHot";
+
 /// File in the folder of a run with its settings.
 pub const SETTINGS: &str = "settings.json";
 
@@ -144,6 +149,12 @@ pub struct Environment {
     /// What the agent observes: a vector that describes the frame.
     #[arg(long = "environment.observation", default_value = "features", value_parser = ["features"])]
     pub observation: String,
+    /// What makes vectors of integers: `endless_gym_agents.popgym:Vectors`, which adds the previous action and whether a step is the
+    /// first of its episode, as POPGym's agents observe them, or `endless_gym_agents.popgym:OneHot`, which does not [default: Vectors
+    /// where observations are integers].
+    #[arg(long = "environment.wrapper", value_name = "CLASS", value_parser = [VECTORS, ONE_HOT])]
+    #[serde(default)]
+    pub wrapper: Vec<String>,
     /// Number of environments in all groups.
     #[arg(long = "environment.num-envs", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
     pub num_envs: usize,
