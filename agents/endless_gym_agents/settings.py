@@ -190,6 +190,9 @@ class PPO:
     """discount factor"""
     gae_lambda: Share = 0.95
     """lambda of generalised advantage estimation"""
+    bootstrap_truncated: bool = False
+    """where a time limit ends an episode (`truncated`), add the discounted value of its last observation to its last reward, as
+    if it went on. By default such an end counts as any other, as in the paper"""
     clip_range: AboveZero = 0.1
     """clip range epsilon of the policy loss and of the value loss"""
     advantage_normalisation: Literal["none", "batch", "minibatch"] = "none"

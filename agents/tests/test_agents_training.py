@@ -18,7 +18,7 @@ from endless_gym import make_vec
 from endless_gym_agents.common.clock import Clock
 from endless_gym_agents.environments.groups import Environments
 from endless_gym_agents.evaluation.evaluate import evaluate, mean
-from endless_gym_agents.settings import PRESETS, Settings
+from endless_gym_agents.settings import PRESETS, VECTORS, Settings
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.ppo import learn, make_optimizer
 from endless_gym_agents.training.train import check_resumable, choose_device, parse, restore_generator, train
@@ -337,3 +337,46 @@ def test_agent_with_memory_learns_a_command_that_is_shown_and_hidden(agent: str,
     given = changed(given, environment={"option": ("command_count=[1]",)}, ppo={"updates": 200})
     trained = checkpoint.load(train(given))
     assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085
+
+
+@pytest.mark.parametrize(
+    ("agent", "env"),
+    [
+        ("gru", "popgym-MultiarmedBanditEasy-v0"),
+        ("trxl", "popgym-MultiarmedBanditEasy-v0"),
+        ("gru", "popgym-BattleshipEasy-v0"),
+    ],
+)
+def test_bootstrapping_adds_the_value_of_the_last_observation_at_time_limits(agent: str, env: str) -> None:
+    """Against episodes played one after another, with the values of their last observations."""
+    given = changed(
+        settings(agent, env=env),
+        environment={"num_envs": 3, "wrapper": (VECTORS,)},
+        ppo={"steps": 256},
+    )
+    plain, bootstrapped = (changed(given, ppo={"bootstrap_truncated": is_on}) for is_on in (False, True))
+    with collecting(plain) as collector:
+        expected = collector.collect(Clock())[0]
+        rewards = expected.reward.clone()
+    with collecting(bootstrapped) as collector, Environments(given) as environments:
+        segment, made = collector.collect(Clock())[0], collector.agent
+        for name in ("value", "action", "done", "log_prob", "last_value"):
+            assert torch.equal(getattr(segment, name), getattr(expected, name)), name
+        memories = [made.initial_memory(1) for _ in range(3)]
+        environments.reset(0)
+        ends = 0
+        for step in range(256):
+            for number, memory in enumerate(memories):
+                made.act({key: part[step, number : number + 1] for key, part in segment.observation.items()}, memory)
+            environments.send(segment.action[step].numpy(), 0)
+            result = environments.receive(0)
+            for number in np.flatnonzero(result.truncated):
+                assert result.final is not None
+                value = made.act({"features": result.final[number][None]}, memories[number]).value
+                rewards[step, number] += given.ppo.gamma * float(value)
+                ends += 1
+            for number in np.flatnonzero(result.done):
+                memories[number] = made.initial_memory(1)
+        assert ends >= 3
+    torch.testing.assert_close(segment.reward, rewards, rtol=1e-5, atol=1e-5)
+    assert not torch.equal(segment.reward, expected.reward)

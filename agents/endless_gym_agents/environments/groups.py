@@ -30,6 +30,8 @@ class StepResult:
         observation: Observation after the step; where an episode has ended, the first one of the next episode.
         reward: float64 (n,), that of the wrappers, if there are any.
         done: Whether the episode has ended, bool (n,).
+        truncated: Whether a time limit has ended it, bool (n,).
+        final: The last observation of each episode that has ended, an array of n objects; None if none has ended.
         ground_truth: Ground truth of the observation, float64 (n, entries); None if the environment has none.
         episodes: Final infos of the episodes that have ended, one dict each.
     """
@@ -37,6 +39,8 @@ class StepResult:
     observation: NDArray[Any] | dict[str, NDArray[Any]]
     reward: NDArray[np.float64]
     done: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    final: NDArray[np.object_] | None
     ground_truth: NDArray[np.float64] | None
     episodes: list[dict[str, float]]
 
@@ -143,7 +147,8 @@ class Environments:
             final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
             final.pop("ground_truth", None)
             episodes = [{key: float(value[env]) for key, value in final.items()} for env in np.flatnonzero(done)]
-        return StepResult(observation, reward, done, info.get("ground_truth"), episodes)
+        ended_by_time, last, truth = truncated & ~terminated, info.get("final_obs"), info.get("ground_truth")
+        return StepResult(observation, reward, done, ended_by_time, last, truth, episodes)
 
     def mark(self, report: Callable[[str], None]) -> None:
         """Mark the current state as the one from which a replacement continues if the engine process fails.
@@ -204,4 +209,5 @@ class Environments:
 
     def _start(self, observation: Any, info: dict[str, Any]) -> StepResult:
         zeros = np.zeros(self.per_group)
-        return StepResult(observation, zeros, zeros.astype(np.bool_), info.get("ground_truth"), [])
+        none = zeros.astype(np.bool_)
+        return StepResult(observation, zeros, none, none, None, info.get("ground_truth"), [])

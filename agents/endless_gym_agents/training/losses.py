@@ -16,7 +16,7 @@ def generalised_advantages(
 ) -> Tensor:
     """Generalised advantage estimation (Schulman et al., 2016).
 
-    There is no bootstrapping at the end of an episode, including one that ends at the step limit.
+    There is no bootstrapping at the end of an episode; `PPO.bootstrap_truncated` makes it a part of the rewards.
 
     Args:
         rewards: Reward of step `t`, (T, N).

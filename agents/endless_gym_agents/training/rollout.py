@@ -14,7 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from endless_gym_agents.agent.agent import Agent, AgentMemory
@@ -37,7 +39,7 @@ class Segment:
         action: int64 (T, N, branches).
         log_prob: Log-probability of the choice in each branch, float32 (T, N, branches).
         value: Value estimate of the observation, float32 (T, N).
-        reward: Reward of the step, float32 (T, N).
+        reward: Reward of the step, float32 (T, N); with `PPO.bootstrap_truncated`, plus the discounted value at a time limit.
         done: Whether the step ended its episode, bool (T, N).
         ground_truth: Ground truth of the observation, float32 (T, N, entries); None if the agent does not estimate it.
         last_value: Bootstrap value: the value estimate of the observation after the last step, float32 (N,).
@@ -267,10 +269,24 @@ class RolloutCollector:
         outcome = self._parts[group].outcome[step + 1]
         # One copy for both. `_act` has waited for the last one.
         self._outcomes[group][0], self._outcomes[group][1] = result.reward, result.done
-        self._uploads[group].copy(self._outcomes[group], outcome)
         memory = self.memories[group]
+        if self.agent.settings.ppo.bootstrap_truncated and result.truncated.any():
+            self._outcomes[group][0] += self._values_beyond(result, memory)
+        self._uploads[group].copy(self._outcomes[group], outcome)
         memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
         return result.episodes
+
+    def _values_beyond(self, result: StepResult, memory: AgentMemory) -> NDArray[np.float32]:
+        """Discounted values of the last observations where a time limit ended the episode, else 0, float32 (n,)."""
+        if result.final is None:
+            raise ValueError("--ppo.bootstrap-truncated needs `final_obs`; a wrapper drops it from `info`")
+        agent = self.agent
+        observation = {key: np.array(value) for key, value in agent.as_mapping(result.observation).items()}
+        for env in np.flatnonzero(result.truncated):
+            for key, value in agent.as_mapping(result.final[env]).items():
+                observation[key][env] = value
+        values: NDArray[np.float32] = agent.bootstrap_value(observation, memory).cpu().numpy()
+        return agent.settings.ppo.gamma * values * result.truncated
 
     @torch.no_grad()
     def _segment(self) -> Segment:
