@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from agents_helpers import changed, settings
+from agents_helpers import changed, saved, settings
 from rich.console import Console
 
 import endless_gym_agents
@@ -109,6 +109,27 @@ def test_evaluation_plays_each_seed_equally_often_and_is_reproducible(runs: Path
     assert to_json(again, {}, True) == to_json(once, {}, True)
     other = evaluate_runs(small(runs, action_seed=1), quiet)
     assert to_json(other, {}, True) != to_json(once, {}, True)
+
+
+def test_the_last_checkpoints_of_runs_that_stop_when_learnt_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed, steps in ((1, 32), (2, 64)):
+        for name, stops in (("learnt", True), ("interrupted", False)):
+            given = settings("gru", env=GRID, seed=seed, stop_when_learnt=stops, environment={"num_envs": 4})
+            saved(tmp_path / name / str(seed), given, steps=steps)
+    file = tmp_path / "all.json"
+    for name, status in (("learnt", 0), ("interrupted", 1)):
+        arguments = ["endless-eval", str(tmp_path / name), "--last", "--seeds", "2", "--json", str(file)]
+        monkeypatch.setattr(sys, "argv", arguments)
+        assert protocol.main() == status
+        printed = capsys.readouterr()
+        assert ("no checkpoints at a common number of steps" in printed.err) is bool(status)
+    (summary,) = json.loads(file.read_text())["experiments"][0]["summary"]
+    assert summary["over"] == "2 runs that stopped from 32 steps on"
+    (found,) = read(file)
+    assert found.common_steps() == [64] and found.scores("reward").shape == (2, 1)
+    assert [run.steps for run in found.runs] == [[32], [64]]
 
 
 def test_a_foreign_run_does_not_prevent_the_evaluation_of_others(

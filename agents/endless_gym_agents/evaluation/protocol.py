@@ -39,7 +39,7 @@ class EvalArguments:
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """checkpoint files, folders of runs, or folders that contain runs at any depth"""
     last: bool = False
-    """evaluate only the last checkpoint of each run"""
+    """evaluate only the last checkpoint of each run; runs that stop when they have learnt are compared at their ends"""
     first_seed: Natural = EVALUATION_SEEDS.start
     """first seed; the seeds are consecutive"""
     seeds: Positive = 50
@@ -141,7 +141,10 @@ def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] 
                 settings = loaded.settings
                 if run is None:
                     run = Run(str(folder), settings.seed)
-                    experiments.of(settings).runs.append(run)
+                    experiment = experiments.of(settings)
+                    stops = settings.stop_when_learnt or settings.target_reward is not None
+                    experiment.last = arguments.last and stops and (experiment.last or not experiment.runs)
+                    experiment.runs.append(run)
                 results = evaluate(
                     loaded.agent,
                     seeds,

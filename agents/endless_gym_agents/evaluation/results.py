@@ -62,22 +62,27 @@ class Experiment:
         label: Name in plots and tables, such as `gru_rec`.
         options: Reset parameters.
         runs: The runs.
+        last: Whether the last checkpoints of the runs are compared, although these may have stopped at different steps.
     """
 
     env: str
     label: str
     options: dict[str, Any] = field(default_factory=dict)
     runs: list[Run] = field(default_factory=list)
+    last: bool = False
 
     def common_steps(self) -> list[int]:
-        """Numbers of environment steps at which every run has a checkpoint, ascending."""
+        """Numbers of environment steps at which every run has a checkpoint, ascending; of `last` checkpoints the largest one."""
+        if self.last:
+            return [max(run.steps[-1] for run in self.runs)]
         steps = set(self.runs[0].steps).intersection(*(run.steps for run in self.runs))
         return sorted(steps)
 
     def scores(self, metric: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
         """Mean of a metric for each run and checkpoint, float64 (runs, common steps)."""
         steps = self.common_steps()
-        return np.array([[run.metrics[metric][run.steps.index(step)] for step in steps] for run in self.runs])
+        places = [[-1] if self.last else [run.steps.index(step) for step in steps] for run in self.runs]
+        return np.array([[run.metrics[metric][i] for i in found] for run, found in zip(self.runs, places, strict=True)])
 
     def summaries(self, metric: str) -> list[tuple[int, Summary, str]]:
         """Estimates of a metric for each checkpoint: over the runs, or over the episodes if there is a single run.
@@ -87,7 +92,8 @@ class Experiment:
         """
         if len(self.runs) > 1:
             columns = self.scores(metric).T
-            over = f"{len(self.runs)} runs"
+            fewest = min(run.steps[-1] for run in self.runs)
+            over = f"{len(self.runs)} runs" + f" that stopped from {fewest:,} steps on" * self.last
             return [(step, summarise(column), over) for step, column in zip(self.common_steps(), columns, strict=True)]
         (run,) = self.runs
         return [
@@ -190,7 +196,10 @@ def read(file: Path) -> list[Experiment]:
     try:
         written = json.loads(regular.text(file))["experiments"]
         return [
-            Experiment(one["env"], one["label"], one["options"], [Run(**run) for run in one["runs"]]) for one in written
+            Experiment(
+                one["env"], one["label"], one["options"], [Run(**run) for run in one["runs"]], one.get("last", False)
+            )
+            for one in written
         ]
     except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{file} is not a file of `endless-eval --json`") from error
