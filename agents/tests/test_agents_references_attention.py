@@ -1,11 +1,15 @@
 """Memories against recorded results of their authors' code with the same weights, in float64; see `references`."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
+from torch.nn import functional
 
 from endless_gym_agents.memories.ffm import FFM
 from endless_gym_agents.memories.gated import LSTM
@@ -13,7 +17,8 @@ from endless_gym_agents.memories.mingru import MinGRU
 from endless_gym_agents.memories.recurrent import RecurrentMemory
 from endless_gym_agents.memories.sequence_model import SequenceModel, State
 from endless_gym_agents.memories.shm import SHM
-from endless_gym_agents.settings import Recurrence
+from endless_gym_agents.memories.transformer import MASKED, Attention, Gate, normalised
+from endless_gym_agents.settings import Recurrence, Transformer
 
 
 class Record:
@@ -142,6 +147,88 @@ def test_outputs_states_and_gradients_are_those_of_the_authors(name: str, by_ste
         gradient = gradients[key].grad
         assert gradient is not None, key
         assert_close(gradient, expected, key)
+
+
+@pytest.fixture
+def float64() -> Iterator[None]:
+    """Encodings of distances in double precision, too."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.usefixtures("float64")
+def test_relative_attention_and_gates_are_those_of_the_gtrxl_of_di_engine() -> None:
+    """Its network, made of our attention and gates.
+
+    Its projections have biases. Those of keys and positions add a constant to all scores of a query; those of queries and values
+    are a part of the other biases. It takes queries from inputs that are not normalised, divides scores by the root of a head's
+    size, and has a ReLU after the attention and two layers after that.
+    """
+    record = Record("gtrxl")
+    theirs = {name: part.requires_grad_() for name, part in record.by_name("weight").items()}
+    attention = Attention(Transformer(width=16, heads=2, shared_heads=False, positional_encoding="relative"))
+    attention.scale, gate = 8**-0.5, Gate(16, 2.0)
+    x, memory = record.sequence("input").requires_grad_(), record.arrays["initial.memory"].transpose(1, 2)
+    distance = 16 + torch.arange(48).unsqueeze(1) - torch.arange(64)
+    mask = torch.zeros(48, 64).masked_fill(distance < 0, MASKED).expand(3, 1, -1, -1)
+
+    def gated(layer: str, x: Tensor, y: Tensor) -> Tensor:
+        parts = {"from_y": "Wr Wz Wg", "from_x": "Ur Uz", "from_reset": "Ug"}
+        weights = {
+            f"{ours}.weight": torch.cat([theirs[f"{layer}.{each}.weight"] for each in names.split()])
+            for ours, names in parts.items()
+        }
+        return functional_call(gate, weights | {"bias": theirs[f"{layer}.bg"]}, (x, y))  # type: ignore[no-any-return]
+
+    h, inputs = x.transpose(0, 1), []
+    for number in range(2):
+        layer = f"layers.{number}"
+        inputs.append(h)
+
+        def of(name: str, layer: str = layer) -> tuple[Tensor, Tensor]:
+            return theirs[f"{layer}.{name}.weight"], theirs[f"{layer}.{name}.bias"]
+
+        (kv, kv_bias), (q, q_bias), (out, out_bias) = (
+            of(f"attention.{name}.0") for name in ("attention_kv", "attention_q", "project")
+        )
+        keys, values = kv.chunk(2)
+        weights = {
+            "queries.weight": q,
+            "keys.weight": keys,
+            "values.weight": values,
+            "fc_out.weight": out,
+            "fc_out.bias": out_bias + out @ kv_bias.chunk(2)[1],
+            "distances.weight": of("attention.project_pos.0")[0],
+            "content_bias": (theirs["u"] + q_bias.view(2, 8)).unsqueeze(1),
+            "distance_bias": (theirs["v"] + q_bias.view(2, 8)).unsqueeze(1),
+        }
+        gain, bias = of("layernorm1")
+        tokens = normalised(torch.cat([memory[number], h], dim=1))
+        given = (h, tokens, SimpleNamespace(weight=gain, bias=bias), mask, torch.zeros(3, 48, 1).bool(), distance, None)
+        h = gated(f"{layer}.gate1", h, functional_call(attention, weights, given).relu())
+        y = functional.layer_norm(h, (16,), *of("layernorm2"))
+        for part in ("mlp.0.0", "mlp.2.0"):
+            y = functional.linear(y, *of(part)).relu()
+        h = gated(f"{layer}.gate2", h, y)
+    assert_close(h.transpose(0, 1), record.sequence("output"), "output")
+    inputs.append(h)
+    assert_close(
+        torch.stack([part[:, -16:].transpose(0, 1) for part in inputs]), record.arrays["final.memory"], "memory"
+    )
+    (h.transpose(0, 1) * record.sequence("probe")).sum().backward()
+    assert x.grad is not None
+    assert_close(x.grad, record.sequence("grad.input"), "gradient of the input")
+    for name, weight in theirs.items():
+        found, expected = weight.grad, record.arrays[f"grad.{name}"]
+        if "project_pos.0.bias" in name:
+            assert found is None and float(expected.abs().max()) < 1e-10
+            continue
+        assert found is not None, name
+        if "attention_kv.0.bias" in name:
+            assert float(expected[:16].abs().max()) < 1e-10
+            found, expected = found[16:], expected[16:]
+        assert_close(found, expected, name)
 
 
 def test_ffm_starts_with_the_rates_of_the_authors_and_keeps_their_limits() -> None:
