@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from endless_gym_agents.common import command
-from endless_gym_agents.evaluation import enjoy, plot
+from endless_gym_agents.evaluation import compare, enjoy, plot
 from endless_gym_agents.paper import reproduce, search
 from endless_gym_agents.training import train
 
@@ -25,6 +25,7 @@ def of(arguments: type, *first: str) -> Callable[[list[str]], Any]:
         (of(enjoy.EnjoyArguments, "run"), "--seeds", ("3", "4"), (3, 4)),
         (of(plot.PlotArguments), "--published", ("gru", "trxl"), ("gru", "trxl")),
         (of(plot.PlotArguments), "--env", ("A", "B"), ("A", "B")),
+        (of(compare.CompareArguments), "--range", ("a=0,1", "b=0,1"), ("a=0,1", "b=0,1")),
         (of(reproduce.ReproduceArguments), "--seeds", ("1", "2"), (1, 2)),
     ],
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from agents_helpers import saved, settings
 
-from endless_gym_agents.evaluation import plot
+from endless_gym_agents.evaluation import compare, plot
 from endless_gym_agents.paper import reproduce, search
 from endless_gym_agents.training import train
 
@@ -35,6 +35,7 @@ def test_an_agent_loads_and_acts_without_the_extras(tmp_path: Path) -> None:
     [
         (train.main, "--env MortarMayhem-Grid-v0 --ppo.updates 1", "training needs tensorboard"),
         (plot.main, "--env MortarMayhem-v0", "a plot needs matplotlib"),
+        (compare.main, "results.json", "a comparison needs matplotlib"),
         (search.main, "--env MortarMayhem-Grid-v0", "the search needs optuna"),
         (reproduce.main, "endless", "endless-reproduce needs tensorboard"),
     ],

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from endless_gym_agents.evaluation.statistics import interquartile_mean, stratified_bootstrap, summarise
+from endless_gym_agents.evaluation.statistics import (
+    coverage,
+    improvement,
+    improvement_interval,
+    interquartile_mean,
+    interval,
+    optimality_gaps,
+    stratified_bootstrap,
+    summarise,
+    wilson,
+)
 
 
 @pytest.mark.parametrize(
@@ -47,6 +57,71 @@ def test_bootstrap_interval_has_its_nominal_coverage() -> None:
     samples = np.random.default_rng(0).normal(size=(200, 40))
     covered = [low < 0 < high for low, high in (stratified_bootstrap(sample, repetitions=300) for sample in samples)]
     assert 0.87 < np.mean(covered) < 0.99
+
+
+def test_interval_of_one_task_is_about_students() -> None:
+    """Of 1, 2, 3: the mean has the standard error 1 / sqrt(3), and two degrees of freedom the quantile 4.303."""
+    low, high = interval([1, 2, 3])
+    assert (low + high) / 2 == pytest.approx(2)
+    assert (high - low) / 2 == pytest.approx(4.303 / 3**0.5, rel=0.03)
+    assert interval([2.0]) == (2.0, 2.0)
+    assert interval([[0, 10], [0, 10]]) == (5.0, 5.0)
+
+
+def test_degrees_of_freedom_are_those_of_the_tasks_that_vary() -> None:
+    """Of two tasks, one varies: two degrees of freedom. Both as much: four, and the quantile 2.776."""
+    (one_low, one_high), (low, high) = (
+        interval([[1, 5], [2, 5], [3, 5]]),
+        interval([[1, 5], [2, 6], [3, 7]], optimality_gaps),
+    )
+    assert (low, high) == (0.0, 0.0)
+    table = np.array([[1, 5], [2, 6], [3, 7]]) / 10
+    both_low, both_high = interval(table, optimality_gaps)
+    assert (both_high - both_low) / 2 == pytest.approx(2.776 * 0.1 / 3**0.5 / 2**0.5, rel=0.03)
+    assert one_low < 3.5 < one_high
+
+
+def test_optimality_gap_ignores_what_is_above_1() -> None:
+    assert optimality_gaps(np.array([[0.5, 1.5, 1.0, 0.0]])) == pytest.approx([0.375])
+
+
+def test_probability_of_improvement_by_hand() -> None:
+    """Of the nine pairs of the first task, seven are better and one is equal; the second task is a tie."""
+    assert improvement([[1, 0], [3, 0], [5, 0]], [[0, 0], [1, 0], [2, 0]]) == pytest.approx((7.5 / 9 + 0.5) / 2)
+
+
+def test_probability_of_improvement_of_shifted_normals() -> None:
+    """P(X > Y) is the normal distribution at the shift over sqrt(2)."""
+    generator = np.random.default_rng(0)
+    first, second = 1 + generator.normal(size=(1000, 2)), generator.normal(size=(1000, 2))
+    assert improvement(first, second) == pytest.approx(0.7602, abs=0.02)
+    covered = []
+    for _ in range(500):
+        p = improvement(1 + generator.normal(size=(3, 4)), generator.normal(size=(3, 4)))
+        low, high = improvement_interval(p, 3, 3, 4)
+        covered.append(low <= 0.7602 <= high)
+    assert 0.94 < np.mean(covered) < 0.995
+
+
+def test_interval_of_the_probability_of_improvement_is_the_test_of_mann_and_whitney() -> None:
+    """Five runs each, all in order: the exact two-sided p is 2 / 252. Three each: 2 / 20, which is not significant."""
+    assert improvement_interval(1.0, 5, 5, 1)[0] > 0.5
+    assert improvement_interval(1.0, 3, 3, 1)[0] < 0.5
+    low, high = improvement_interval(0.3, 4, 6, 2)
+    assert (1 - high, 1 - low) == pytest.approx(improvement_interval(0.7, 4, 6, 2), abs=1e-3)
+
+
+def test_wilsons_interval() -> None:
+    """Of 2 in 10, a textbook's example: 0.057 to 0.510."""
+    assert wilson(0.2, 10) == pytest.approx((0.0567, 0.5098), abs=1e-4)
+    assert wilson(1.0, 18)[1] == 1.0 and wilson(0.0, 18)[0] == 0.0
+
+
+@pytest.mark.parametrize(("runs", "tasks"), [(3, 6), (5, 1)])
+def test_intervals_cover_with_few_runs(runs: int, tasks: int) -> None:
+    for one in coverage(runs, tasks, 1000):
+        assert one.iqm > 0.92 and one.gap > 0.92 and one.improvement > 0.93, one
+        assert one.percentile < (0.9 if runs == 3 else 0.96)
 
 
 def test_summary() -> None:

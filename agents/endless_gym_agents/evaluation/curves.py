@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym_agents.evaluation.results import Experiment, label, metric
-from endless_gym_agents.evaluation.statistics import interquartile_mean, stratified_bootstrap
+from endless_gym_agents.evaluation.statistics import interquartile_mean, interval
 from endless_gym_agents.training.checkpoint import read_settings
 from endless_gym_agents.training.logs import PROGRESS, read_progress
 
@@ -62,10 +62,10 @@ class Curve:
         return mean, mean - std, mean + std
 
     def interquartile_mean(self) -> tuple[Floats, Floats, Floats]:
-        """Interquartile mean over the runs, and the ends of its 95 % bootstrap interval, float64 (checkpoints,) each."""
+        """Interquartile mean over the runs, and the ends of its 95 % interval, float64 (checkpoints,) each."""
         means = np.array([interquartile_mean(column) for column in self.scores.T])
         tables = [column.reshape(self.tasks, -1).T for column in self.scores.T]
-        ends = np.array([stratified_bootstrap(table, repetitions=1000) for table in tables])
+        ends = np.array([interval(table, repetitions=1000) for table in tables])
         return means, ends[:, 0], ends[:, 1]
 
     def until(self, steps: int) -> Curve:

@@ -61,7 +61,7 @@ class PlotArguments:
     environments, and divided by the best mean of the paper's GRU in endless ones"""
     spread: Spread = "std"
     """std: mean over the runs and one standard deviation, as in the aggregated plots of the paper; iqm: interquartile mean and
-    its 95 % bootstrap interval; runs: one line per run, as in the other plots of the paper"""
+    its 95 % interval, corrected for few runs; runs: one line per run, as in the other plots of the paper"""
     max_steps: Natural = 0
     """largest number of environment steps to plot; 0 for all"""
 

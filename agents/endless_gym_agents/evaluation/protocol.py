@@ -26,9 +26,11 @@ from rich.table import Table
 
 from endless_gym_agents.common import atomic, command, tables
 from endless_gym_agents.common.ranges import Natural, Positive
+from endless_gym_agents.evaluation.conformance import state_bytes
 from endless_gym_agents.evaluation.evaluate import EVALUATION_SEEDS, REPETITIONS, evaluate
 from endless_gym_agents.evaluation.results import Experiment, Experiments, Run, metric, to_json
 from endless_gym_agents.training import checkpoint
+from endless_gym_agents.training.logs import PROGRESS, read_progress
 from endless_gym_agents.training.train import choose_device
 
 
@@ -102,6 +104,18 @@ def find(paths: tuple[Path, ...], last: bool) -> list[tuple[Path, list[Path]]]:
     return list(found.items())
 
 
+def cost(loaded: checkpoint.Checkpoint, folder: Path) -> dict[str, float]:
+    """What an agent and its run took, for `Run.cost`."""
+    found: dict[str, float] = {
+        "parameters": loaded.agent.num_parameters,
+        "state_bytes": state_bytes(loaded.agent.initial_memory(1).state),
+    }
+    if loaded.settings.threads == 1 and (folder / PROGRESS).exists():
+        rows = read_progress(folder)
+        found["core_seconds"] = round(sum(row[name] for row in rows for name in row if name.startswith("seconds/")), 2)
+    return found
+
+
 def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] | None = None) -> list[Experiment]:
     """Evaluate all checkpoints.
 
@@ -140,7 +154,7 @@ def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] 
                     continue
                 settings = loaded.settings
                 if run is None:
-                    run = Run(str(folder), settings.seed)
+                    run = Run(str(folder), settings.seed, cost=cost(loaded, folder))
                     experiment = experiments.of(settings)
                     stops = settings.stop_when_learnt or settings.target_reward is not None
                     experiment.last = arguments.last and stops and (experiment.last or not experiment.runs)
@@ -162,7 +176,7 @@ def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] 
 def table(experiment: Experiment) -> Table:
     """A table with all metrics of the last checkpoint, and the paper's metric for the earlier ones.
 
-    The interval is the bootstrap interval of the interquartile mean (IQM) of the runs, or of the mean of a run's episodes. Final
+    The interval is that of the interquartile mean (IQM) of the runs, or of the mean of a run's episodes. Final
     infos that count failures as successes are marked, and the caption says which metric to trust.
     """
     options = "".join(f", {name}={value}" for name, value in experiment.options.items())

@@ -35,6 +35,7 @@ class Run:
         steps: Environment steps before each checkpoint, ascending.
         metrics: Mean over the episodes of each checkpoint, by name of the metric.
         episodes: Final infos of the episodes of each checkpoint; empty if they were not stored.
+        cost: What the run took: `parameters`, `state_bytes` and, if one thread learnt, `core_seconds`; as far as it is known.
     """
 
     run: str
@@ -42,6 +43,7 @@ class Run:
     steps: list[int] = field(default_factory=list)
     metrics: dict[str, list[float]] = field(default_factory=dict)
     episodes: list[list[dict[str, float]]] = field(default_factory=list)
+    cost: dict[str, float] = field(default_factory=dict)
 
     def add(self, steps: int, episodes: Sequence[Mapping[str, float]]) -> None:
         """Append a checkpoint with its number of environment steps and the final infos of its episodes."""
