@@ -5,6 +5,7 @@ import json
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from endless_gym_agents.evaluation import compare, ruler
 from endless_gym_agents.evaluation.compare import Comparison, Score
+from endless_gym_agents.evaluation.plot import PlotArguments, draw_all
 from endless_gym_agents.evaluation.results import Experiment, Run, to_json
 
 GRID = "MortarMayhem-Grid-v0"
@@ -223,3 +225,24 @@ def test_names_of_runs_and_their_costs_are_read(tmp_path: Path) -> None:
         in page
     )
     assert "| `gru (small)` | 1 | 1.00 | 0.00 | 1.00 | 120 | 512 |" in page
+
+
+def test_all_tasks_of_the_results_count_in_an_aggregated_plot(tmp_path: Path) -> None:
+    """Two tasks of one environment, of which one is not in the ruler."""
+    files = tuple(
+        evaluated(tmp_path / f"{label}-{option}.json", label, option, [value * option, value * option])
+        for label, value in (("ppo", 0.02), ("gru", 0.06))
+        for option in (2, 4)
+    )
+    arguments = PlotArguments(files, tmp_path / "out", aggregate="all", spread="runs")
+    (picture,) = draw_all(arguments)
+    curves = {curve["label"]: curve for curve in json.loads(picture.with_suffix(".json").read_text())["curves"]}
+    assert curves["gru"]["steps"] == [32, 64]
+    assert np.array(curves["gru"]["scores"]) == pytest.approx(np.array([[-0.25, 0.5]] * 4), abs=1e-2)
+    assert np.array(curves["ppo"]["scores"])[:, 1] == pytest.approx(np.zeros(4))
+    (picture,) = draw_all(replace(arguments, range=("two-commands=0,0.12",)))
+    assert json.loads(picture.with_suffix(".json").read_text())["curves"][1]["scores"][0][1] == pytest.approx(1.0)
+    with pytest.raises(
+        ValueError, match=r"gru: the plot of all tasks needs evaluations in MortarMayhem.*count=\[4\], too"
+    ):
+        draw_all(replace(arguments, paths=files[:3]))

@@ -1,11 +1,10 @@
-"""The ruler and the leaderboard's program: the scores of experts, POPGym's observations, and runs of a small table."""
+"""The ruler and the leaderboard: the scores of experts, POPGym's observations, and runs of small tables."""
 
-import importlib.util
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -14,23 +13,12 @@ from agents_helpers import changed
 
 from endless_gym import spec
 from endless_gym_agents.agent.agent import make_agent
-from endless_gym_agents.evaluation import ruler
+from endless_gym_agents.evaluation import conformance, ruler
 from endless_gym_agents.evaluation.ruler import TASKS
+from endless_gym_agents.paper import leaderboard
 from endless_gym_agents.paper.experiments.definitions import settings_of
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training import train as training
-
-PROGRAM = Path(__file__).parents[1] / "benches" / "leaderboard.py"
-
-
-@pytest.fixture(scope="module")
-def leaderboard() -> ModuleType:
-    described = importlib.util.spec_from_file_location("leaderboard", PROGRAM)
-    assert described is not None
-    assert described.loader is not None
-    module = importlib.util.module_from_spec(described)
-    described.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize("name", ["one-command", "path", "repeat-first", "count-recall"])
@@ -56,15 +44,17 @@ def test_a_longer_version_fits_the_agents_of_its_task() -> None:
 
 
 @pytest.mark.parametrize("name", ["laptop", "full"])
-def test_the_agents_of_a_size_have_as_many_parameters_as_that_of_the_gru(name: str, leaderboard: ModuleType) -> None:
+def test_the_agents_of_a_size_have_as_many_parameters_as_that_of_the_gru(name: str) -> None:
     track = leaderboard.read(name)
-    assert len([agent for agent in track["agents"] if agent not in leaderboard.MEMORYLESS]) >= 12
-    assert set(track["tasks"]) <= TASKS.keys()
-    for size in track["sizes"]:
-        written = leaderboard.experiment(track, ["three-commands"], track["agents"], [size])
+    assert len([agent for agent in track.agents if agent not in leaderboard.MEMORYLESS]) >= 12
+    assert set(track.tasks) <= TASKS.keys()
+    for size in track.sizes:
         counts = {}
-        for run in written["runs"]:
-            given = settings_of(run["env"], run["flags"]).validated()
+        for entry, _ in track.sized(list(track.agents.values()), [size]):
+            task, flags = track.run(
+                TASKS["three-commands"], entry, "-" if entry.agent in leaderboard.MEMORYLESS else size
+            )
+            given = settings_of(task.env, flags).validated()
             with torch.device("meta"):
                 counts[given.agent] = make_agent(given, spec(given.env), "meta").num_parameters
         for agent in counts.keys() - set(leaderboard.MEMORYLESS):
@@ -90,56 +80,236 @@ def test_agents_of_popgym_resume_exactly(tmp_path: Path) -> None:
         make_agent(changed(given, environment={"wrapper": ()}), spec(given.env))
 
 
-@pytest.mark.slow
-def test_the_program_fills_the_table_and_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, leaderboard: ModuleType, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(*arguments: str) -> list[dict[str, Any]]:
-        results = tmp_path / "laptop.results.json"
-        given = ["laptop", "--seeds", "1", "--scale", "tiny", "--jobs", "2", "--device", "cpu"]
-        given += ["--out", str(tmp_path / "runs"), "--results", str(results)]
-        monkeypatch.setattr(sys, "argv", ["leaderboard.py", *given, *arguments])
-        leaderboard.main()
-        return list(json.loads(results.read_text())["rows"])
+def mean_row(agent: str, task: str, seed: int, score: float) -> dict[str, Any]:
+    base = {"size": "-", "parameters": 1, "acting": 1, "learning": 1, "state_bytes": 1, "minutes": 1, "steps": 10}
+    return {"agent": agent, "task": task, "seed": seed, "score": score, "longer": score / 2} | base
 
-    rows = run("--agents", "none", "mingru", "--tasks", "one-command", "repeat-first")
-    assert [(row["agent"], row["task"]) for row in rows] == [
-        (agent, task) for agent in ("mingru", "none") for task in ("one-command", "repeat-first")
+
+def test_the_page_has_scores_gates_and_longer_versions() -> None:
+    track = replace(leaderboard.read("laptop"), tasks={name: TASKS[name] for name in ("one-command", "repeat-first")})
+    rows = [
+        mean_row(agent, task, seed, score)
+        for agent, scores in {"none": (0.02, -0.5), "gru": (0.1, 1.0)}.items()
+        for task, score in zip(track.tasks, scores, strict=True)
+        for seed in (1, 2)
+    ]
+
+    def page(rows: list[dict[str, Any]]) -> str:
+        return leaderboard.page(track, rows, leaderboard.compared(track, rows, Path("rows")), {})
+
+    made = page(rows)
+    assert "| `gru` | 2 | 1.00 [1.00, 1.00] | 0.00 [0.00, 0.00] | 1.00 | 1.00 |" in made
+    assert "| `none` | 2 | 0.00 [0.00, 0.00] | 1.00 [1.00, 1.00] | 0.00 | 0.00 |" in made
+    assert "| repeat-first | object | 1 | -0.500 | passed |" in made
+    assert "| `gru` | 0.10 → 0.05 | 1.00 → 0.50 |" in made
+    # An agent with holes has no mean, and a task without zero is left out.
+    assert "| `gru` | 1-2 | incomplete |  | 1.00 | 1.00 |" in page(rows[:-1])
+    assert (
+        "repeat-first |"
+        not in page([row for row in rows if row["agent"] == "gru" or row["task"] == "one-command"]).split(
+            "Mean returns"
+        )[0]
+    )
+    with pytest.raises(ValueError, match="needs the runs of `none` in a task, or a `zero`"):
+        page([row for row in rows if row["agent"] == "gru"])
+
+
+TRACK: dict[str, Any] = {
+    "about": "Two tasks.",
+    "tasks": [
+        "one-command",
+        {"name": "two", "env": "MortarMayhem-Grid-v0", "options": ["command_count=[2]"], "zero": 0.0},
+    ],
+    "agents": ["none", {"name": "gru-wide", "agent": "gru", "flags": {"recurrence.hidden-size": 32}}],
+    "seeds": [1],
+    "flags": {
+        "preset": "quick",
+        "environment.num-envs": 4,
+        "ppo.steps": 32,
+        "ppo.updates": 1,
+        "recurrence.hidden-size": 16,
+    },
+    "evaluation": {"seeds": 2, "repetitions": 1},
+}
+TUNING: dict[str, Any] = {
+    "task": "late-command",
+    "trials": 3,
+    "space": {"ppo.learning-rate": [1e-3, 3e-4], "ppo.entropy-coefficient": [1e-3, 1e-4]},
+    "of": {"other": {"recurrence.layers": [1, 2]}},
+    "own": {"lru": {"agent-option": [[], ["block=false"]]}},
+}
+
+
+def written(folder: Path, **changes: Any) -> Path:
+    file = folder / "mine.json"
+    file.write_text(json.dumps(TRACK | changes))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"seed": [1]},
+            "track mine: `seed` is unknown, missing or empty; allowed: about, tasks, agents, seeds, flags, task-flags",
+        ),
+        ({"agents": []}, "track mine: `agents` is unknown, missing or empty"),
+        ({"tasks": ["nope"]}, "track mine: a task must be an object, or one of one-command, .*; got `nope`"),
+        ({"tasks": [{"env": "Nope-v0"}]}, "track mine, task Nope-v0: id must be one of "),
+        (
+            {"tasks": [{"id": "x"}]},
+            "track mine, tasks: must be a name, or an object with `env` and some of name, options, zero",
+        ),
+        ({"agents": [{"name": "a/b"}]}, "a name has letters, digits and any of `_.:=+-`, got `a/b`"),
+    ],
+)
+def test_mistakes_in_a_track_are_named(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=re.escape(message).replace(r"\.\*", ".*")):
+        leaderboard.read(str(written(tmp_path, **changes)))
+    with pytest.raises(ValueError, match="track must be one of full, laptop, path, or a JSON file; got `nope`"):
+        leaderboard.read("nope")
+
+
+def test_all_agents_are_tuned_with_the_same_common_choices(tmp_path: Path) -> None:
+    track = leaderboard.read(str(written(tmp_path, agents=["none", "gru", "lru"], tuning=TUNING)))
+    assert track.tasks["two"].expert == pytest.approx(0.2)  # played by the environment's expert
+    found = {name: leaderboard.trials(track, entry) for name, entry in track.agents.items()}
+    common = ("ppo.learning-rate", "ppo.entropy-coefficient")
+    assert [len(one) for one in found.values()] == [3, 3, 3]
+    for one in found.values():
+        assert [tuple(one[0][name] for name in common)] == [(1e-3, 1e-3)]
+        assert len({json.dumps(trial) for trial in one}) == 3
+    assert set(found["none"][0]) == set(common) and set(found["lru"][0]) == {
+        *common,
+        "recurrence.layers",
+        "agent-option",
+    }
+    assert found["lru"][0]["agent-option"] == []
+    # A memory of your own has choices of its own, and no more trials than there are choices.
+    mine = leaderboard.Entry("mine", {"agent": "mine.py:Mine"})
+    assert "agent-option" in leaderboard.trials(track, mine, {"agent-option": [["a=1"], ["a=2"]]})[0]
+    small = replace(track, tuning=TUNING | {"trials": 99})
+    assert len(leaderboard.trials(small, track.agents["none"])) == 4
+
+
+@pytest.mark.slow
+def test_a_track_of_your_own_is_tuned_resumed_and_extended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = written(tmp_path, tuning=TUNING | {"trials": 2})
+
+    def run(*arguments: str) -> dict[str, Any]:
+        given = [str(file), "--jobs", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
+        monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given, *arguments])
+        assert leaderboard.main() == 0, capsys.readouterr().err
+        return dict(json.loads((tmp_path / "out/mine/results.json").read_text()))
+
+    data = run()
+    rows = {(row["agent"], row["task"], row["seed"]): row for row in data["rows"]}
+    assert set(rows) == {(agent, task, 1) for agent in ("none", "gru-wide") for task in ("one-command", "two")}
+    trials = data["tuning"]["gru-wide -"]["trials"]
+    assert len(trials) == 2 and data["tuning"]["gru-wide -"]["task"] == "late-command"
+    best = max(trials, key=lambda trial: trial["score"])
+    assert data["tuning"]["gru-wide -"]["best"] == trials.index(best)
+    given = checkpoint.read_settings(tmp_path / "out/runs/MortarMayhem-Grid-v0/two gru-wide -/seed-1")
+    assert (given.ppo.learning_rate, given.recurrence.layers) == (
+        best["flags"]["ppo.learning-rate"],
+        best["flags"]["recurrence.layers"],
+    )
+    assert (given.recurrence.hidden_size, given.options()) == (32, {"command_count": [2]})
+    assert rows["gru-wide", "two", 1]["tuning_core_seconds"] == pytest.approx(
+        sum(trial["core_seconds"] for trial in trials)
+    )
+    page = (tmp_path / "out/mine/README.md").read_text()
+    assert "Each agent was tuned with up to 2 configurations on a task outside of the table." in page
+    assert "core-seconds of tuning" in page and "128 steps; 0 becomes 0, and 0.2 becomes 1." in page
+    assert (tmp_path / "out/mine/comparison.pdf").read_bytes().startswith(b"%PDF")
+    # The same again trains nothing; another agent is tuned and added.
+    capsys.readouterr()
+    assert run() == data
+    assert "started" not in capsys.readouterr().out
+    more = run("--agents", "mingru", "--tasks", "one-command")
+    assert len(more["rows"]) == 5 and set(more["tuning"]) == {"none -", "gru-wide -", "mingru -"}
+    # A task of the table is none to tune on.
+    written(tmp_path, tuning=TUNING | {"task": "one-command"})
+    with pytest.raises(ValueError, match="agents must be tuned on a task outside of the table, got one-command"):
+        leaderboard.execute(leaderboard.LeaderboardArguments(str(file), out=tmp_path / "other"))
+
+
+@pytest.mark.slow
+def test_an_agent_enters_a_track_of_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With as few steps, and the best agents exported; the budgets of the package's rows are others, which is refused."""
+
+    def run(*arguments: str) -> int:
+        given = [
+            "laptop",
+            "--seeds",
+            "1",
+            "--scale",
+            "tiny",
+            "--jobs",
+            "2",
+            "--device",
+            "cpu",
+            "--out",
+            str(tmp_path / "out"),
+        ]
+        monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given, *arguments])
+        return leaderboard.main()
+
+    given = ("--agents", "mingru", "none", "--tasks", "one-command", "repeat-first")
+    assert run(*given) == 1
+    assert "unequal budgets in one-command: " in capsys.readouterr().err
+    # Without the package's rows.
+    (tmp_path / "out/laptop").mkdir(exist_ok=True)
+    (tmp_path / "out/laptop/results.json").write_text("{}")
+    best = tmp_path / "best"
+    assert run(*given, "--best", str(best)) == 0
+    rows = json.loads((tmp_path / "out/laptop/results.json").read_text())["rows"]
+    assert [(row["agent"], row["task"], row["steps"] > 0) for row in rows] == [
+        (agent, task, True) for agent in ("mingru", "none") for task in ("one-command", "repeat-first")
     ]
     for row in rows:
-        assert row["longer"] is not None
-        assert row["steps"] > 0
-        assert (row["state_bytes"] > 0) == (row["agent"] == "mingru")
-    # The same again trains nothing, and other agents add rows.
-    capsys.readouterr()
-    assert run("--agents", "none", "mingru", "--tasks", "one-command", "repeat-first") == rows
-    assert "started" not in capsys.readouterr().out
-    assert len(run("--agents", "ffm", "--tasks", "one-command")) == 5
-    page = (tmp_path / "laptop.md").read_text()
-    assert "| `ffm` | gru |" in page
-    assert "| one-command | object | 0.1 |" in page
+        assert row["longer"] is not None and (row["state_bytes"] > 0) == (row["agent"] == "mingru")
+    page = (tmp_path / "out/laptop/README.md").read_text()
+    assert "| `mingru` | 1 |" in page and "| one-command | object | 0.1 |" in page
     # The best agent of a task, of those that the page plays; the page has no POPGym.
-    best = tmp_path / "best"
-    run("--agents", "none", "mingru", "ffm", "--tasks", "one-command", "repeat-first", "--table", "--best", str(best))
     assert [file.name for file in best.iterdir()] == ["one-command.safetensors"]
     scores = {row["agent"]: row["score"] for row in rows if row["task"] == "one-command"}
     exported = checkpoint.load(best / "one-command.safetensors").agent
     assert scores[exported.settings.agent] == max(scores.values())
 
 
-def test_the_interquartile_mean_is_that_of_normalised_scores(leaderboard: ModuleType) -> None:
-    track = {"name": "t", "about": "-", "tasks": ["one-command", "repeat-first"]}
-    base = {"parameters": 1, "acting": 1, "learning": 1, "state_bytes": 1}
-    rows = [
-        {"agent": agent, "size": "-", "task": task, "seed": seed, "score": score, "longer": score / 2, **base}
-        for agent, scores in {"none": (0.02, -0.5), "gru": (0.1, 1.0)}.items()
-        for task, score in zip(track["tasks"], scores, strict=True)
-        for seed in (1, 2)
-    ]
-    page = leaderboard.table(track, rows)
-    assert "| `gru` | - | 1.00 | 1.00 to 1.00 | 1.00 | 1.00 |" in page
-    assert "| `none` | - | 0.00 | 0.00 to 0.00 | 0.00 | 0.00 |" in page
-    assert "| repeat-first | object | 1 | -0.500 | passed |" in page
-    assert "| `gru` | - | 0.10 → 0.05 | 1.00 → 0.50 |" in page
-    # A table with holes has no mean.
-    assert "| `gru` | - |  | incomplete | 1.00 |" in leaderboard.table(track, rows[:-1])
+def test_the_rows_of_the_package_have_equal_budgets() -> None:
+    for name in ("laptop", "path"):
+        track = leaderboard.read(name)
+        comparison = leaderboard.compared(track, track.rows["rows"], Path(name))
+        assert set(comparison.aggregates) == track.agents.keys(), name
+
+
+@pytest.mark.slow
+def test_the_page_from_idea_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one update, and without the environment that the page builds."""
+    text = (Path(__file__).parents[2] / "docs/train/from-idea-to-table.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    (memory,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    Path("decay.py").write_text(memory)
+    assert all(result.passed for result in conformance.check("decay.py:Decay", steps=100, long=300))
+    (study,) = re.findall(r"<<'EOF'\n(.*?)EOF\n", text, re.S)
+    track = json.loads(study)
+    track["tasks"] = [task for task in track["tasks"] if isinstance(task, str)]
+    assert len(track["tasks"]) == 1
+    Path("study.json").write_text(json.dumps(track))
+    given = ["study.json", "--scale", "tiny", "--agents", "none", "decay-fixed", "--seeds", "1", "2", "--device", "cpu"]
+    monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given])
+    assert leaderboard.main() == 0
+    listed = re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|", text.split("## The table")[1].split("## Tuning")[0], re.M)
+    named = {name for cell in listed for name in re.findall(r"`([\w.]+)`", cell)}
+    assert {file.name for file in Path("leaderboard/study").iterdir()} == named
+    # The part of a track about tuning is one, too.
+    (tuning,) = re.findall(r"```text\n(.*?)```", text, re.S)
+    Path("tuned.json").write_text(json.dumps(track | json.loads(f"{{{tuning}}}")))
+    tuned = leaderboard.read("tuned.json")
+    assert [len(leaderboard.trials(tuned, entry)) for entry in tuned.agents.values()] == [6, 8, 8, 8]

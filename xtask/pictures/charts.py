@@ -281,35 +281,3 @@ def hour(folder: Path) -> None:
         header(figure, theme, "An hour on one core", note)
 
     chart(folder, "hour", 1.9 * rows + 0.9, draw)
-
-
-def memories(folder: Path, track: str) -> None:
-    """Scores of the memories of a track of `agents/benches/leaderboard.py`, from its results and into their folder."""
-    summary = [one for one in json.loads((folder / f"{track}.results.json").read_text())["summary"] if "iqm" in one]
-    tasks = list(summary[0]["tasks"])
-
-    def draw(figure: Figure, theme: Theme) -> None:
-        height = figure.get_figheight()
-        left, *others = figure.subplots(1, 1 + len(tasks), sharey=True, width_ratios=[2.6, *[1] * len(tasks)])
-        places = range(len(summary))
-        for axes, title in zip((left, *others), ("interquartile mean", *tasks), strict=True):
-            plain(axes)
-            axes.set_title(title.replace("-", "\n"), loc="left", fontsize=SMALL, color=theme.faint)
-            axes.set(xlim=(-0.1, 1.1), ylim=(len(summary) - 0.4, -0.6))
-            axes.set_xticks([0, 1])
-            axes.grid(axis="x", lw=1)
-        left.set_yticks(places, [one["agent"] for one in summary])
-        for place, one in zip(places, summary, strict=True):
-            left.plot(
-                [one["low"], one["high"]], [place] * 2, color=theme.blue, lw=5, alpha=0.35, solid_capstyle="round"
-            )
-            left.plot(one["iqm"], place, "o", color=theme.blue, ms=6.5, mec="none")
-            for axes, task in zip(others, tasks, strict=True):
-                axes.plot(one["tasks"][task], place, "o", color=theme.grey, ms=5.5, mec="none", clip_on=False)
-        figure.subplots_adjust(0.13, 0.28 / height, 0.985, 1 - 1.05 / height, wspace=0.25)
-        note = (
-            f"0: without memory, 1: scripted expert. {summary[0]['seeds']} seeds for each task; bars: 95 % intervals."
-        )
-        header(figure, theme, "Memories", note)
-
-    chart(folder, track, 0.26 * len(summary) + 1.4, draw)

@@ -1,8 +1,8 @@
-"""Makes the pictures of the documentation in `docs/images`, and those of the learning curves and the leaderboard: `cargo xtask
-pictures` installs the packages and runs this script.
+"""Makes the pictures of the documentation in `docs/images`, and those of the learning curves: `cargo xtask pictures` installs the
+packages and runs this script.
 
 The animations are episodes of the scripted experts with fixed seeds. The charts show `benches/comparison.md` and the results of
-`agents/benches/learning.py`, `leaderboard.py` and `hour.py`; measure or train again to change them. The same versions give the
+`agents/benches/learning.py` and `hour.py`; measure or train again to change them. The same versions give the
 same bytes.
 """
 
@@ -14,7 +14,6 @@ import films
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs/images"
 LEARNING = ROOT / "agents/benches/learning"
-LEADERBOARD = ROOT / "agents/benches/leaderboard"
 HOUR = ROOT / "agents/benches/hour"
 
 
@@ -24,7 +23,6 @@ def main() -> None:
     charts.comparison(IMAGES, ROOT / "benches/comparison.md")
     charts.learning(IMAGES, LEARNING / "three-commands.json")
     charts.tasks(LEARNING)
-    charts.memories(LEADERBOARD, "laptop")
     charts.hour(HOUR)
     films.overview(IMAGES / "environments.webp")
     for scene in films.SCENES:

@@ -41,6 +41,7 @@ from endless_gym_agents.settings import Environment, Settings
 COSTS: dict[str, tuple[str, Callable[[Sequence[float]], float]]] = {
     "parameters": ("parameters", statistics.median),
     "core_seconds": ("core-seconds of a run", statistics.mean),
+    "tuning_core_seconds": ("core-seconds of tuning", max),
     "state_bytes": ("bytes of state", max),
     "acting": ("acting, steps/s", max),
     "learning": ("learning, steps/s", max),
@@ -329,7 +330,7 @@ def read_scores(paths: Sequence[Path], metric: str = "reward") -> tuple[list[Sco
             protocols.setdefault(json.dumps(data["protocol"], sort_keys=True), file)
             found = list(_of_evaluation(file, metric, experts))
         else:
-            found = [_of_row(row, file) for row in data["rows"]]
+            found = [of_row(row, file) for row in data["rows"]]
             if metric != "reward":
                 raise ValueError(f"--metric {metric}: {file} has only returns")
             experts |= {name: ruler.TASKS[name].expert for name in {row.task for row in found} & ruler.TASKS.keys()}
@@ -395,7 +396,7 @@ def _expert(experiment: results.Experiment) -> float | None:
         return None
 
 
-def _of_row(row: Mapping[str, Any], file: Path) -> Score:
+def of_row(row: Mapping[str, Any], file: Path) -> Score:
     """A row of `endless-leaderboard`; agents without memory have the size `-`, and others `gru` by default."""
     agent = row["agent"] if row.get("size", "-") in ("-", "gru") else f"{row['agent']} ({row['size']})"
     cost = {name: float(row[name]) for name in COSTS if row.get(name) is not None}
@@ -587,7 +588,7 @@ def draw(comparison: Comparison, out: Path) -> None:
     for axes in (left, middle, right):
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-    with matplotlib.rc_context({"svg.hashsalt": "endless", "pdf.fonttype": 42}):
+    with matplotlib.rc_context({"svg.hashsalt": "endless", "svg.fonttype": "none", "pdf.fonttype": 42}):
         for kind, date in (("svg", "Date"), ("pdf", "CreationDate")):
             with atomic.replacing(out / f"comparison.{kind}") as new:
                 figure.savefig(new, format=kind, metadata={date: None})
@@ -600,8 +601,13 @@ def csv_text(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def write(comparison: Comparison, out: Path) -> list[Path]:
+def write(comparison: Comparison, out: Path, page: str = "") -> list[Path]:
     """Write the tables and figures of a comparison into a folder, which is made if it does not exist.
+
+    Args:
+        comparison: The comparison.
+        out: The folder.
+        page: The page, Markdown, if not that of `markdown`.
 
     Returns:
         The files.
@@ -611,7 +617,7 @@ def write(comparison: Comparison, out: Path) -> list[Path]:
     """
     command.check_installed("a comparison", "matplotlib")
     out.mkdir(parents=True, exist_ok=True)
-    pages = {"README.md": "\n".join([*markdown(comparison), "![comparison](comparison.svg)"]) + "\n"}
+    pages = {"README.md": page or "\n".join([*markdown(comparison), "![comparison](comparison.svg)"]) + "\n"}
     pages["agents.csv"] = csv_text(*cells(comparison))
     rows = [
         (row.task, row.agent, row.seed, row.steps, row.score, comparison.normalised(row.task, row.score))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -180,17 +180,25 @@ def aggregate(family: Family, curves: Sequence[Curve]) -> list[Curve]:
             others = found[source, f"{name}_rec"].items()
             own = own | {env: curve for env, curve in others if env == _WITH_RECONSTRUCTION}
         if set(own) == set(FAMILIES[family]):
-            aggregated.append(_aggregate_one(family, name, [own[env] for env in FAMILIES[family]]))
+            curves = [own[env] for env in FAMILIES[family]]
+            aggregated.append(
+                joined(family, name, [replace(one, scores=one.scores / scale(one.env)) for one in curves])
+            )
     return aggregated
 
 
-def _aggregate_one(family: str, name: str, curves: Sequence[Curve]) -> Curve:
+def joined(family: str, name: str, curves: Sequence[Curve]) -> Curve:
+    """A curve over several environments, from normalised ones: their common steps, and as many runs as each has.
+
+    Raises:
+        ValueError: There are no such steps.
+    """
     steps = sorted(set(curves[0].steps.tolist()).intersection(*(curve.steps.tolist() for curve in curves)))
     if not steps:
         raise ValueError(
             f"the runs of {name} have no checkpoints at a common number of steps in all {family} environments"
         )
     runs = min(len(curve.scores) for curve in curves)
-    parts = [curve.scores[:runs, np.isin(curve.steps, steps)] / scale(curve.env) for curve in curves]
+    parts = [curve.scores[:runs, np.isin(curve.steps, steps)] for curve in curves]
     at = np.array(steps, dtype=np.int64)
     return Curve(family, name, curves[0].source, at, np.concatenate(parts), len(curves))

@@ -6,6 +6,7 @@ Each plot is a PNG file, with a CSV file of the plotted values and a JSON file o
 endless-plot                                         # the curves of the paper
 endless-plot results.json --published gru trxl       # an evaluation and the paper's curves, one plot per environment
 endless-plot results.json --aggregate endless        # all endless environments in one plot
+endless-plot results.json --aggregate all            # all tasks of the results in one plot, also your own
 endless-plot runs/mine                               # the training rewards of a run
 ```
 """
@@ -13,6 +14,7 @@ endless-plot runs/mine                               # the training rewards of a
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import re
 import sys
@@ -21,12 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import tyro
 
 from endless_gym.program.printable import printable
 from endless_gym_agents.common import atomic, command
 from endless_gym_agents.common.palette import AGENTS
 from endless_gym_agents.common.ranges import Natural
+from endless_gym_agents.evaluation import compare
 from endless_gym_agents.evaluation.curves import (
     AXES,
     FAMILIES,
@@ -34,12 +38,13 @@ from endless_gym_agents.evaluation.curves import (
     Floats,
     aggregate,
     evaluated,
+    joined,
     published,
     published_environments,
     published_labels,
     training,
 )
-from endless_gym_agents.evaluation.results import metric, read
+from endless_gym_agents.evaluation.results import Experiment, metric, read
 
 Spread = Literal["std", "iqm", "runs"]
 
@@ -56,9 +61,12 @@ class PlotArguments:
     """agents of the paper to include, where it has their curves; `--published` without a value for none"""
     env: tuple[str, ...] = ()
     """environments to plot; by default those of the given results, or without results all environments of the paper"""
-    aggregate: Literal["no", "finite", "endless"] = "no"
-    """one plot over all environments of this kind instead of one plot per environment; scores are the task progress in finite
-    environments, and divided by the best mean of the paper's GRU in endless ones"""
+    aggregate: Literal["no", "finite", "endless", "all"] = "no"
+    """one plot over all environments of this kind of the paper instead of one plot per environment; scores are the task progress
+    in finite environments, and divided by the best mean of the paper's GRU in endless ones. all: over all tasks of the results,
+    normalised as by `endless-compare`"""
+    range: tuple[str, ...] = ()
+    """with `--aggregate all`: the returns that become 0 and 1 in a task, as for `endless-compare`"""
     spread: Spread = "std"
     """std: mean over the runs and one standard deviation, as in the aggregated plots of the paper; iqm: interquartile mean and
     its 95 % interval, corrected for few runs; runs: one line per run, as in the other plots of the paper"""
@@ -180,6 +188,35 @@ def read_curves(paths: Sequence[Path]) -> list[Curve]:
     return curves
 
 
+def aggregate_tasks(paths: Sequence[Path], given: Sequence[str] = ()) -> list[Curve]:
+    """The normalised returns of each agent over all tasks of files of results.
+
+    Args:
+        paths: The files.
+        given: The returns that become 0 and 1, as `--range` takes them.
+
+    Raises:
+        ValueError: An agent lacks a task, or a task the returns that become 0 and 1.
+    """
+    rows, experts = compare.read_scores(paths)
+    ranges = compare.ranges_of(rows, experts, given)
+    found: dict[str, dict[str, Experiment]] = {}
+    for experiment in itertools.chain.from_iterable(map(read, paths)):
+        own = found.setdefault(experiment.label, {})
+        task = compare.task_name(experiment.env, experiment.options)
+        own.setdefault(task, Experiment(task, experiment.label)).runs.extend(experiment.runs)
+    curves = []
+    for label, own in found.items():
+        if missing := [task for task in ranges if task not in own]:
+            raise ValueError(f"{label}: the plot of all tasks needs evaluations in {', '.join(missing)}, too")
+        parts = []
+        for task, (zero, one) in ranges.items():
+            steps, scores = np.array(own[task].common_steps(), dtype=np.int64), own[task].scores("reward")
+            parts.append(Curve(task, label, "evaluated", steps, (scores - zero) / (one - zero)))
+        curves.append(joined("all", label, parts))
+    return curves
+
+
 def draw_all(arguments: PlotArguments) -> list[Path]:
     """Draw all requested plots.
 
@@ -190,7 +227,7 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
         FileNotFoundError: A path does not exist.
         ValueError: There are no curves for an environment, or too few for an aggregated plot.
     """
-    own = read_curves(arguments.paths)
+    own = [] if arguments.aggregate == "all" else read_curves(arguments.paths)
     known, labels = published_environments(), published_labels()
     if unknown := [label for label in arguments.published if label not in labels]:
         raise ValueError(f"--published must be among {', '.join(labels)}, got `{unknown[0]}`")
@@ -207,6 +244,9 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
             command.check_outputs(outputs, [path for path in arguments.paths if path.is_file()])
             plots.append(draw(name, axis, curves, arguments.spread, arguments.out))
 
+    if arguments.aggregate == "all":
+        add("all", "Normalised return", aggregate_tasks(arguments.paths, arguments.range))
+        return plots
     if arguments.aggregate != "no":
         paper = [curve for env in FAMILIES[arguments.aggregate] for curve in published(env, arguments.published)]
         curves = aggregate(arguments.aggregate, [*own, *paper])

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from math import sqrt
 
 import numpy as np
@@ -220,6 +221,7 @@ def _two_modes(generator: np.random.Generator, count: int, runs: int, tasks: int
 POPULATIONS = {"graded": _graded, "extreme": _extreme, "two modes": _two_modes}
 
 
+@cache
 def coverage(runs: int, tasks: int, repetitions: int = 1000) -> list[Coverage]:
     """Simulate how often the intervals cover with this number of runs, 2 or more, in each of this number of tasks."""
     found = []
