@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from endless_gym_agents.evaluation import enjoy, plot, probe, protocol, record
-from endless_gym_agents.paper import reproduce, search
+from endless_gym_agents.evaluation import compare, enjoy, plot, probe, protocol, record
+from endless_gym_agents.paper import leaderboard, reproduce, search
 from endless_gym_agents.training import train
 
 GRID = "--env MortarMayhem-Grid-v0"
@@ -24,6 +24,8 @@ PROGRAMS = {
     "endless-record": record.main,
     "endless-search": search.main,
     "endless-reproduce": reproduce.main,
+    "endless-compare": compare.main,
+    "endless-leaderboard": leaderboard.main,
 }
 
 
@@ -107,6 +109,22 @@ PROGRAMS = {
         ("endless-reproduce finite --nice 20 --status", "--nice must be 0 to 19, got 20"),
         ("endless-reproduce finite --jobs -1 --status", "--jobs must be 0 or more, got -1"),
         ("endless-reproduce endless --ray", NO_RAY),
+        ("endless-compare", "no path given; expected files of `endless-eval --json`"),
+        ("endless-compare nowhere", "no such file or folder: nowhere; expected results"),
+        ("endless-compare text.json", "text.json is not a file of results"),
+        ("endless-compare foreign", "no results in foreign; evaluate its runs with: endless-eval foreign --last"),
+        ("endless-compare one.json", "--metric must be one of task_progress in one.json, got `reward`"),
+        (
+            "endless-compare one.json --metric task_progress",
+            "MysteryPath-v0 .* lacks runs of `none` and an expert: --range",
+        ),
+        ("endless-compare one.json --metric task_progress --range a=1,2", "--range: no runs of task `a`; there are "),
+        ("endless-leaderboard nope", "track must be one of full, laptop, path, or a JSON file; got `nope`"),
+        ("endless-leaderboard nope.json", r"\[Errno 2\] No such file or directory: 'nope.json'"),
+        ("endless-leaderboard text.json", "track text: `tasks` is unknown, missing or empty; allowed: about, tasks"),
+        ("endless-leaderboard laptop --tasks nope", "--tasks must be among one-command, .*, got `nope`"),
+        ("endless-leaderboard laptop --sizes tiny", "--sizes must be among gru, small, got `tiny`"),
+        ("endless-leaderboard laptop --scale 2", "--scale must be greater than 0 and at most 1, or tiny; got `2`"),
         ("endless-reproduce endless --ray auto --job-cpus 0", "--job-cpus must be 1 or more, got 0"),
         ("endless-reproduce endless --ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
     ],
@@ -149,6 +167,8 @@ def test_user_error_prints_one_line_and_leaves_no_file(
         ("endless-probe .", "--episode 10", "--episodes"),
         ("endless-search", "--prunner asha", "--pruner"),
         ("endless-reproduce finite", "--scales 1", "--scale"),
+        ("endless-compare .", "--metrics reward", "--metric"),
+        ("endless-leaderboard laptop", "--agent gru", "--agents"),
     ],
 )
 def test_an_unknown_flag_suggests_the_nearest(

@@ -327,7 +327,7 @@ def read_scores(paths: Sequence[Path], metric: str = "reward") -> tuple[list[Sco
         if data is None:
             raise ValueError(f"{file} is not a file of results, as `endless-eval --json` writes it")
         if "experiments" in data:
-            protocols.setdefault(json.dumps(data["protocol"], sort_keys=True), file)
+            protocols.setdefault(json.dumps(data.get("protocol"), sort_keys=True), file)
             found = list(_of_evaluation(file, metric, experts))
         else:
             found = [of_row(row, file) for row in data["rows"]]
@@ -348,7 +348,7 @@ def _content(file: Path) -> dict[str, Any] | None:
         data = json.loads(regular.text(file))
     except (UnicodeDecodeError, json.JSONDecodeError):
         return None
-    return data if isinstance(data, dict) and ("rows" in data or {"experiments", "protocol"} <= data.keys()) else None
+    return data if isinstance(data, dict) and data.keys() & {"rows", "experiments"} else None
 
 
 def _files(path: Path) -> list[Path]:

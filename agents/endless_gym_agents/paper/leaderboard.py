@@ -478,9 +478,11 @@ def execute(arguments: LeaderboardArguments) -> None:
         raise ValueError(f"--sizes must be among {', '.join(track.sizes)}, got `{wrong[0]}`")
     command.check_installed("a comparison", "matplotlib")
     entries = [track.agents.get(name) or _entry(name) for name in arguments.agents] or list(track.agents.values())
-    folder = arguments.out / track.name
+    scale = planning.read_scale(arguments.scale)
+    folder = planning.folder_of(arguments.out, scale) / track.name
     results = folder / "results.json"
-    data = json.loads(results.read_text()) if results.exists() else track.rows
+    # Those of the package have another budget than a smaller version.
+    data = json.loads(results.read_text()) if results.exists() else track.rows if scale == 1 else {}
     data = {"rows": data.get("rows", []), "tuning": data.get("tuning", {})}
     if track.tuning:
         tuned(track, entries, data, arguments)
