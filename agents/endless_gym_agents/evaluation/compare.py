@@ -48,6 +48,8 @@ COSTS: dict[str, tuple[str, Callable[[Sequence[float]], float]]] = {
 }
 #: Scores at which the performance profile is computed.
 THRESHOLDS = np.linspace(0, 1, 51)
+#: Most agents whose profiles are drawn.
+PROFILES = 6
 #: Designs that `--coverage` simulates: tasks and seeds.
 DESIGNS = tuple(itertools.product((1, 3, 6, 10), (3, 5, 10)))
 
@@ -559,7 +561,7 @@ def latex(comparison: Comparison) -> str:
 
 
 def draw(comparison: Comparison, out: Path) -> None:
-    """Draw interquartile means, optimality gaps and performance profiles with their intervals, as `comparison.svg` and `.pdf`."""
+    """Draw interquartile means, optimality gaps and the best performance profiles, as `comparison.svg` and `.pdf`."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -574,6 +576,8 @@ def draw(comparison: Comparison, out: Path) -> None:
             if one.low is not None and one.high is not None:
                 axes.plot([one.low, one.high], [number] * 2, color=colour, lw=4, alpha=0.35)
             axes.plot(one.value, number, "o", color=colour)
+        if number >= PROFILES:
+            continue
         shares = [one.value for one in found.profile]
         right.plot(THRESHOLDS, shares, color=colour, label=f"{agent}, {found.seeds} seeds", drawstyle="steps-post")
         if found.seeds > 1:
@@ -583,7 +587,10 @@ def draw(comparison: Comparison, out: Path) -> None:
     middle.set_yticks(range(len(agents)), [])
     for axes, title in ((left, "Interquartile mean"), (middle, "Optimality gap")):
         axes.set(title=title, ylim=(len(agents) - 0.5, -0.5))
-    right.set(title="Performance profile", xlabel="Normalised score", ylabel="Share of runs above it", ylim=(0, 1.02))
+    best = f" of the best {PROFILES}" if len(agents) > PROFILES else ""
+    right.set(
+        title=f"Performance profile{best}", xlabel="Normalised score", ylabel="Share of runs above it", ylim=(0, 1.02)
+    )
     right.legend(fontsize="x-small")
     for axes in (left, middle, right):
         axes.grid(alpha=0.3)
