@@ -80,8 +80,9 @@ pub mod conformance {
 pub mod envs {
     pub use endless_gym_core::envs::{
         ActionBranch, ActionError, ActionSpace, Choice, Column, EnvSpec, Expert, InfoColumn, InvalidActionSpace,
-        InvalidState, Learnt, Metric, ObservationSpace, Parameter, ParameterError, ParameterKind, Progress,
-        ResetParameters, Task, Transition, UnknownEnvironment, box_action, view,
+        InvalidState, Learnt, Metric, ObservationSpace, OriginalTypes, Parameter, ParameterError, ParameterKind,
+        Progress, ResetParameters, RewardType, StatePart, StateSpace, Task, Transition, UnknownEnvironment, box_action,
+        view,
     };
 }
 

@@ -386,7 +386,7 @@ fn another_version_is_refused_with_both_numbers() {
     assert!(error.to_string().contains("install the same version"), "{error}");
 }
 
-const CONTENTS: Contents = Contents { frames: None, features: false, final_observation: false };
+const CONTENTS: Contents = Contents { frames: None, features: false, state: false, final_observation: false };
 
 #[test]
 fn a_malformed_specification_is_an_error_and_not_a_panic() {

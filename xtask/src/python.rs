@@ -203,7 +203,8 @@ pub fn test_agents() -> Result<(), String> {
 pub fn test_original() -> Result<(), String> {
     let environment = environment()?;
     install(&environment)?;
-    pytest(&environment, "bindings/python", "original", &[("ENDLESS_ORIGINAL_PYTHON", original(false)?)])
+    let paths = [("ENDLESS_ORIGINAL_PYTHON", original(false)?), ("ENDLESS_POPGYM_PYTHON", original(true)?)];
+    pytest(&environment, "bindings/python", "original", &paths)
 }
 
 fn mypy(environment: &Path, package: &str) -> Result<(), String> {

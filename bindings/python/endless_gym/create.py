@@ -42,6 +42,7 @@ def make_vec(
     copy: bool = False,
     pin_memory: bool = False,
     independent_episodes: bool = False,
+    state: bool = False,
     first_env: int = 0,
     total_envs: int | None = None,
     render_mode: str | None = None,
@@ -80,6 +81,7 @@ def make_vec(
             parameters, and draw a seed for each episode without one. By default, as in the original, the first frames of an
             episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with the
             last one's background, and an episode without a seed continues the generator of the previous one.
+        state: Add `info["state"]`, the hidden Markov state, float32 (n, k), in environments that tell it: those of POPGym.
         first_env: Number of the first environment, for seeds, if the environments of one trainer are divided among several calls,
             for example one for each rank of a data-parallel run: environment `i` is numbered `first_env + i`.
         total_envs: Total number of environments of all these calls; `None` for `first_env` plus those of this call.
@@ -106,6 +108,7 @@ def make_vec(
         observation,
         frames,
         independent_episodes,
+        state,
         first_env,
         total_envs,
     )

@@ -139,6 +139,7 @@ def serve(
     copy: bool = False,
     pin_memory: bool = False,
     independent_episodes: bool = False,
+    state: bool = False,
     first_env: int = 0,
     total_envs: int | None = None,
     render_mode: str | None = None,
@@ -178,6 +179,7 @@ def serve(
         copy: Return writable copies instead of read-only views of shared memory.
         pin_memory: As for `connect`; the engine lends one extra batch for it, up to 16 in all.
         independent_episodes: As for `make_vec`.
+        state: As for `make_vec`.
         first_env: As for `make_vec`.
         total_envs: As for `make_vec`.
         render_mode: As for `make_vec`.
@@ -203,6 +205,7 @@ def serve(
         observation,
         frames,
         independent_episodes,
+        state,
         first_env,
         total_envs,
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import gymnasium
@@ -20,18 +22,34 @@ from endless_gym.specs import Frames, ObservationName, all_specs, contents, json
 
 Observation = NDArray[Any] | int | tuple[Any, ...] | dict[str, NDArray[Any]]
 
-#: The types of the original's rewards where they are not floats, by what ids contain: functions of the reward and of whether the
-#: step ended the episode.
+#: The types of rewards: functions of the reward and of whether the step ended the episode.
 _REWARDS: dict[str, Callable[[float, bool], float]] = {
-    "MortarMayhem": lambda reward, ended: reward if ended else reward or 0,
-    "Pendulum": lambda reward, ended: np.float64(reward),
-    "LabyrinthExplore": lambda reward, ended: np.float64(reward) if reward > 0 else reward,
-    **dict.fromkeys(
-        ("Autoencode", "RepeatPrevious", "HigherLower", "Concentration"), lambda reward, ended: reward or 0
-    ),
+    "float": lambda reward, ended: reward,
+    "numpy_float": lambda reward, ended: np.float64(reward),
+    "numpy_float_if_positive": lambda reward, ended: np.float64(reward) if reward > 0 else reward,
+    "integer_zero": lambda reward, ended: reward or 0,
+    "integer_zero_until_end": lambda reward, ended: reward if ended else reward or 0,
 }
-#: The final infos that are NumPy's floats in the original.
-_NUMPY_FLOATS = ("commands_completed", "coins_collected")
+
+
+@cache
+def popgym_class() -> type[Env]:
+    """An `Env` that is a `popgym.core.env.POPGymEnv`, which POPGym's wrappers require; an `Env` without the package `popgym`."""
+    registered = dict(gymnasium.registry)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            from popgym.core.env import POPGymEnv
+    except ImportError:
+        return Env
+    # The package registers its own environments, also by ids that `register` may have registered before.
+    gymnasium.registry.update(registered)
+    return type("PopgymEnv", (Env, POPGymEnv), {"__doc__": Env.__doc__})
+
+
+def _made(kind: type[Env], id: str) -> Env:
+    """An environment whose state is to be restored."""
+    return kind.__new__(kind, id)
 
 
 @documented(spec for spec in all_specs().values() if spec.frame)
@@ -46,6 +64,8 @@ class Env(gymnasium.Env[Any, Any]):
     As in the original, an episode can show traces of the previous one: the first frames of Endless-MortarMayhem show the last
     episode's character until the agent may move, so `reset(seed=...)` alone does not determine them. With
     `independent_episodes`, an episode depends only on its seed and its options.
+    Where the package `popgym` is installed, environments that tell their Markov state are its `POPGymEnv`s.
+
     `copy.deepcopy` and `pickle` make an independent environment that continues identically: they copy the state of the episode
     and of the generator, but no window.
 
@@ -79,6 +99,11 @@ class Env(gymnasium.Env[Any, Any]):
         "render_fps": 25,
     }
 
+    def __new__(cls, *args: Any, **kwargs: Any) -> Env:
+        id = args[0] if args else kwargs.get("id")
+        tells_state = cls is Env and isinstance(id, str) and spec(id).markov_state
+        return super().__new__(popgym_class() if tells_state else cls)
+
     def __init__(
         self,
         id: str,
@@ -104,8 +129,12 @@ class Env(gymnasium.Env[Any, Any]):
         self.has_ground_truth_info = self._spec.ground_truth > 0
         if self.has_ground_truth_info:
             self.ground_truth_space = self._spec.ground_truth_space()
-        self._typed_reward = [name for name in _REWARDS if name in id and self._spec.native is _native]
+        #: The space of `get_state`, in POPGym the original's; `None` if the environment does not tell its state.
+        self.state_space = self._spec.state_space()
+        #: Whether the best policy needs the previous action, which the observation does not show.
+        self.obs_requires_prev_action = self._spec.needs_previous_action
         self._truth_dtype = np.int64 if self._spec.ground_truth_is_integer else np.float64
+        self._numpy_floats = self._spec.types.numpy_floats
         self._options = mapping("options", options)
         self._native = self._new_native()
         self._renderer: SnapshotRenderer | None = None
@@ -193,13 +222,34 @@ class Env(gymnasium.Env[Any, Any]):
         if end is not None:
             info["reward"], info["length"], values = end
             for (name, is_integer), value in zip(self._spec.info, values, strict=True):
-                info[name] = int(value) if is_integer else np.float64(value) if name in _NUMPY_FLOATS else value
-        for name in self._typed_reward:
-            reward = _REWARDS[name](reward, end is not None)
+                info[name] = int(value) if is_integer else np.float64(value) if name in self._numpy_floats else value
+        reward = _REWARDS[self._spec.types.reward](reward, end is not None)
         self._is_shown = False
         if self.render_mode == "human":
             self._show()
         return self._observation(arrays), reward, terminated, truncated, info
+
+    def get_state(self) -> Any:
+        """The hidden Markov state, an element of `state_space`, in POPGym the original's.
+
+        Examples:
+            >>> env = Env("popgym-RepeatPreviousEasy-v0")
+            >>> observation, info = env.reset(seed=1)
+            >>> env.state_space
+            Tuple(MultiDiscrete([4 4 4 4]), Box(0.0, 1.0, (4,), float32))
+            >>> env.get_state()[0].tolist() == [0, 0, 0, observation]
+            True
+
+        Raises:
+            ResetNeeded: The environment has not been reset.
+            NotImplementedError: The environment does not tell its state.
+        """
+        state = self._native.state()
+        if state is None:
+            raise NotImplementedError(f"{self._spec.id} does not tell its Markov state")
+        if not self._was_reset:
+            raise ResetNeeded("call `env.reset()` before `env.get_state()`")
+        return self._spec.single_state(state)
 
     def render(self) -> Any:
         """The current frame, view or text of the render mode; `None` for `human` and without a render mode."""
@@ -236,6 +286,11 @@ class Env(gymnasium.Env[Any, Any]):
             self._window.close()
             self._window = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Whether it is a `POPGymEnv` depends on the process.
+        kind = Env if type(self) is popgym_class() else type(self)
+        return _made, (kind, self._spec.full_id), self.__getstate__()
+
     def __getstate__(self) -> dict[str, Any]:
         left_out = ("_native", "_window", "_was_closed", "_renderer")
         state = {name: value for name, value in self.__dict__.items() if name not in left_out}
@@ -258,6 +313,7 @@ class Env(gymnasium.Env[Any, Any]):
             "frames": None if self._frames is None else self._frames.configuration(),
             "features": self._features,
             "independent_episodes": self._independent_episodes,
+            "state": True,
         }
         single: _native.Single = self._spec.native.Single(json_text(config))
         return single

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -58,15 +57,7 @@ def _register(specs: Iterable[Spec], namespace: str | None) -> None:
 
 
 def single(env_id: str, **kwargs: Any) -> Env:
-    """The entry point of `gymnasium.make`; keyword arguments are those of `Env`.
-
-    Where the package `popgym` is installed, an environment of POPGym is a `popgym.core.env.POPGymEnv`.
-    """
-    if env_id.startswith("popgym-"):
-        with suppress(ImportError):
-            from endless_gym.popgym_env import PopgymEnv
-
-            return PopgymEnv(env_id, **kwargs)
+    """The entry point of `gymnasium.make`; keyword arguments are those of `Env`."""
     return Env(env_id, **kwargs)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -109,6 +110,51 @@ class Learnt(NamedTuple):
     mean: float
 
 
+class StatePart(NamedTuple):
+    """A part of the Markov state."""
+
+    #: Name, unique within the environment.
+    name: str
+    #: Meaning and unit.
+    description: str
+    #: The space of its numbers as the engine describes it.
+    space: str | dict[str, Any]
+    #: Its shape; empty for one number.
+    shape: tuple[int, ...]
+    #: Its type in a single environment: a dtype of numpy, or `int` for an integer of Python.
+    dtype: str
+
+    @property
+    def width(self) -> int:
+        """How many numbers it has."""
+        return math.prod(self.shape)
+
+    def gymnasium_space(self) -> gymnasium.Space[Any]:
+        """Its space in Gymnasium."""
+        if isinstance(self.space, str):
+            return spaces.MultiBinary(self.shape[0])
+        if "Integers" in self.space:
+            choices = self.space["Integers"]
+            return spaces.MultiDiscrete(np.full(self.shape, choices)) if self.shape else spaces.Discrete(choices)
+        low, high = (np.resize(_bounds(self.space["Box"], bound), self.shape) for bound in ("low", "high"))
+        return spaces.Box(low, high, dtype=np.float32)
+
+    def values(self, numbers: NDArray[np.float32], dtype: str | None = None) -> NDArray[Any]:
+        """Numbers (..., width) with its shape and its dtype, or that of its space."""
+        return numbers.astype(dtype or self.gymnasium_space().dtype).reshape(numbers.shape[:-1] + self.shape)
+
+
+class OriginalTypes(NamedTuple):
+    """Types of the Python class that an environment reproduces."""
+
+    #: numpy's dtype of arrays of integers in observations.
+    integers: str
+    #: The type of rewards, such as `float`.
+    reward: str
+    #: The names of the final infos that are floats of numpy.
+    numpy_floats: Sequence[str]
+
+
 @dataclass(frozen=True)
 class Spec:
     """The specification of an environment id."""
@@ -131,6 +177,12 @@ class Spec:
     ground_truth_is_integer: bool
     #: The least and the largest of its numbers.
     ground_truth_bounds: tuple[float, float]
+    #: The parts of the Markov state; empty if the environment does not tell it.
+    markov_state: tuple[StatePart, ...]
+    #: Whether the best policy needs the previous action, which the observation does not show.
+    needs_previous_action: bool
+    #: Types of the Python class that the environment reproduces.
+    types: OriginalTypes
     #: Names of the final infos besides `reward` and `length`, and whether the original's value is an int.
     info: tuple[tuple[str, bool], ...]
     #: Names of the feature observation's columns.
@@ -222,8 +274,29 @@ class Spec:
 
     def single_observation(self, features: NDArray[np.float32]) -> Any:
         """The feature observation of one environment, with the original's types: integers of Discrete spaces are Python's."""
-        observation = self.feature_observation(features)
-        return observation.astype(np.int32) if self.id.startswith("popgym-Labyrinth") else _integer(observation)
+        return _single(self.feature_observation(features), self.types.integers)
+
+    def state_space(self) -> gymnasium.Space[Any] | None:
+        """The space of the Markov state, in POPGym the original's; `None` if the environment does not tell it."""
+        parts = [part.gymnasium_space() for part in self.markov_state]
+        return spaces.Tuple(parts) if len(parts) > 1 else next(iter(parts), None)
+
+    def states(self, numbers: NDArray[np.float32]) -> Any:
+        """States, float32 (..., k), as those of the state's space: an array, or a tuple of arrays for its parts."""
+        parts = [part.values(each) for part, each in self._state_parts(numbers)]
+        return tuple(parts) if len(parts) > 1 else parts[0]
+
+    def single_state(self, numbers: NDArray[np.float32]) -> Any:
+        """A state, float32 (k,), with the original's types."""
+        parts = [
+            int(each[0]) if part.dtype == "int" else part.values(each, part.dtype)[()]
+            for part, each in self._state_parts(numbers)
+        ]
+        return tuple(parts) if len(parts) > 1 else parts[0]
+
+    def _state_parts(self, numbers: NDArray[np.float32]) -> Iterable[tuple[StatePart, NDArray[np.float32]]]:
+        ends = np.cumsum([part.width for part in self.markov_state])
+        return zip(self.markov_state, np.split(numbers, ends[:-1], axis=-1), strict=True)
 
     def max_episode_steps(self, options: Mapping[str, Any]) -> int:
         """The step limit of an episode with these reset parameters, as in the original; -1 for none, and for an environment of an
@@ -355,6 +428,9 @@ def described_spec(described: dict[str, Any], module: str = _native.__name__) ->
         ground_truth_columns=_meanings(described["ground_truth"]),
         ground_truth_is_integer=described["ground_truth_is_integer"],
         ground_truth_bounds=tuple(described["ground_truth_bounds"] or (-np.inf, np.inf)),
+        markov_state=tuple(StatePart(**{**part, "shape": tuple(part["shape"])}) for part in described["markov_state"]),
+        needs_previous_action=described["needs_previous_action"],
+        types=OriginalTypes(**described["types"]),
         info=tuple((column["name"], column["is_integer"]) for column in described["info"]),
         features=tuple(column["name"] for column in described["features"]),
         described_features=described["observation_space"],
@@ -376,9 +452,13 @@ def _space(described: dict[str, Any]) -> gymnasium.Space[Any]:
         return spaces.MultiDiscrete(value)
     if kind == "Tuple":
         return spaces.Tuple([_space(part) for part in value])
-    low = np.array([-np.inf if bound is None else bound for bound in value["low"]], np.float32)
-    high = np.array([np.inf if bound is None else bound for bound in value["high"]], np.float32)
-    return spaces.Box(low, high, dtype=np.float32)
+    return spaces.Box(_bounds(value, "low"), _bounds(value, "high"), dtype=np.float32)
+
+
+def _bounds(box: dict[str, Any], name: str) -> NDArray[np.float32]:
+    """The bounds `low` or `high` of a box."""
+    infinity = -np.inf if name == "low" else np.inf
+    return np.array([infinity if bound is None else bound for bound in box[name]], np.float32)
 
 
 def _width(described: dict[str, Any]) -> int:
@@ -405,11 +485,13 @@ def _observation(described: dict[str, Any], features: NDArray[np.float32]) -> An
     return tuple(_observation(part, numbers) for part, numbers in zip(value, parts, strict=True))
 
 
-def _integer(part: Any) -> Any:
-    """The integer of an array without axes."""
+def _single(part: Any, integers: str) -> Any:
+    """An observation with the dtype of its arrays of integers, and the integer of an array without axes."""
     if isinstance(part, tuple):
-        return tuple(map(_integer, part))
-    return part if part.ndim else part.item()
+        return tuple(_single(each, integers) for each in part)
+    if not part.ndim:
+        return part.item()
+    return part.astype(integers, copy=False) if part.dtype.kind == "i" else part
 
 
 def _meanings(described: Iterable[dict[str, str]]) -> tuple[Meaning, ...]:

@@ -111,6 +111,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.num_groups = backend.groups
         self.single_observation_space = results.observation_space
         self.single_action_space = described.action_space()
+        #: The space of one environment's Markov state; `None` if `info` does not have it.
+        self.single_state_space = results.state_space
         self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
         self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
         self.metadata = {

@@ -86,6 +86,11 @@ impl Single {
         arrays::picture(py, self.pool.ground_truth_view(0).map_err(errors::pool)?)
     }
 
+    /// The Markov state; `None` if the environment does not tell it.
+    fn state<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyAny>> {
+        row(py, Batch::new(self.pool.layout(), &self.blocks).state())
+    }
+
     /// The progress of the episode: for each quantity its name, its value, and the value at which the task is complete.
     fn progress(&self) -> PyResult<Vec<(&'static str, f64, Option<f64>)>> {
         let progress = self.pool.progress(0).map_err(errors::pool)?;

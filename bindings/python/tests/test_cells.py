@@ -143,6 +143,8 @@ def test_torchrl_plays_all_of_popgym() -> None:
 @pytest.mark.parametrize("id", POPGYM)
 def test_the_wrappers_of_popgym_take_single_environments(id: str) -> None:
     wrappers = pytest.importorskip("popgym.wrappers")
+    from popgym.core.observability import Observability
+
     env = gymnasium.make(f"EndlessGym/{id}")
     wrapped = wrappers.Flatten(wrappers.Antialias(wrappers.PreviousAction(env)))
     if not isinstance(env.action_space, gymnasium.spaces.Box):
@@ -161,8 +163,8 @@ def test_the_wrappers_of_popgym_take_single_environments(id: str) -> None:
         if terminated or truncated:
             break
     assert env.obs_requires_prev_action == any(name in id for name in ("Band", "Battle", "Conc", "Mine", "Lab"))
-    with pytest.raises(NotImplementedError, match=f"{id} has no hidden state"):
-        wrapped.get_state()
+    markovian = wrappers.Markovian(env, Observability.FULL)
+    assert markovian.observation_space.contains(markovian.reset(seed=1)[0])
     assert pickle.loads(pickle.dumps(env)).obs_requires_prev_action == env.obs_requires_prev_action
 
 

@@ -2,6 +2,11 @@
 
 import gzip
 import json
+import os
+import pickle
+import random
+import subprocess
+import sys
 import threading
 import zlib
 from pathlib import Path
@@ -9,7 +14,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import original_states
 import pytest
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 import endless_gym
@@ -63,6 +70,78 @@ def test_a_single_environment_plays_recorded_episodes(family: str) -> None:
                 assert env.observation_space.contains(observation)
                 assert (flat(observation), [reward, terminated, truncated]) == (expected, end)
             assert info["length"] == len(episode["steps"])
+
+
+def test_states_are_the_originals() -> None:
+    expected = recorded("states")
+    assert set(expected) == set(IDS)
+    for id, described in expected.items():
+        assert original_states.states(endless_gym.Env(id), 20261128) == described, id
+
+
+@pytest.mark.original
+def test_states_are_those_of_the_live_original() -> None:
+    seed = random.SystemRandom().getrandbits(32)
+    command = [os.environ["ENDLESS_POPGYM_PYTHON"], "-W", "ignore", original_states.__file__, str(seed)]
+    expected = json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True, timeout=200).stdout)
+    for id, described in expected.items():
+        assert original_states.states(endless_gym.Env(id), seed) == described, (id, seed)
+
+
+@pytest.mark.parametrize("make", [endless_gym.make_vec, endless_gym.serve])
+@pytest.mark.parametrize("id", [id for id in IDS if "Easy" in id])
+def test_batches_have_the_states(id: str, make: Any) -> None:
+    single = endless_gym.Env(id)
+    single.reset(seed=5)
+    with make(id, 2, seed=4, autoreset="same_step", state=True) as envs:
+        _, info = envs.reset()
+        described, ended = endless_gym.spec(id), False
+        while not ended:
+            state = described.states(info["state"])
+            batched = [part[1].tolist() for part in (state if isinstance(state, tuple) else (state,))]
+            alone = single.get_state()
+            assert batched == [np.asarray(part).tolist() for part in (alone if isinstance(alone, tuple) else (alone,))]
+            actions = envs.action_space.sample()
+            _, _, terminated, truncated, info = envs.step(actions)
+            single.step(actions[1])
+            ended = (terminated | truncated)[1]
+        assert original_states.checksum(described.single_state(info["final_info"]["state"][1])) == (
+            original_states.checksum(single.get_state())
+        )
+
+
+def test_a_state_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ResetNeeded, match=r"before .*get_state"):
+        endless_gym.Env(IDS[0]).get_state()
+    with pytest.raises(NotImplementedError, match="MysteryPath-v0 does not tell its Markov state"):
+        endless_gym.Env("MysteryPath-v0").get_state()
+    with pytest.raises(ValueError, match="state must be False, since MysteryPath-v0 does not tell"):
+        endless_gym.make_vec("MysteryPath-v0", 1, state=True)
+
+
+POPGYM_INSTALLED = """
+import pickle, sys, types
+import gymnasium, endless_gym
+
+class POPGymEnv(gymnasium.Env):
+    pass
+
+endless_gym.register(namespace=None)
+package, core, env = types.ModuleType("popgym"), types.ModuleType("popgym.core"), types.ModuleType("popgym.core.env")
+env.POPGymEnv = POPGymEnv
+sys.modules.update({"popgym": package, "popgym.core": core, "popgym.core.env": env})
+made = endless_gym.Env("popgym-RepeatFirstEasy-v0")
+assert isinstance(made, POPGymEnv) and isinstance(gymnasium.make("popgym-RepeatFirstEasy-v0").unwrapped, POPGymEnv)
+assert not isinstance(endless_gym.Env(id="MysteryPath-v0"), POPGymEnv)
+made.reset(seed=1)
+sys.stdout.buffer.write(pickle.dumps(made))
+"""
+
+
+def test_a_popgym_env_where_popgym_is_installed_and_pickled_for_where_it_is_not() -> None:
+    pickled = subprocess.run([sys.executable, "-c", POPGYM_INSTALLED], stdout=subprocess.PIPE, check=True).stdout
+    env = pickle.loads(pickled)
+    assert isinstance(env, endless_gym.Env) and env.get_state()[1].max() == 1
 
 
 @pytest.mark.parametrize("flatten", [False, True])

@@ -17,7 +17,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use serde_json::{Map, Value as Json, json};
 
 use crate::batch::{Batch, Block, Frames, zeroed};
-use crate::envs::{ActionSpace, EnvSpec, InfoColumn, Parameter, ParameterKind, Task, UnknownEnvironment};
+use crate::envs::{ActionSpace, EnvSpec, InfoColumn, Parameter, ParameterKind, StatePart, Task, UnknownEnvironment};
 use crate::pool::{
     Autoreset, HEAD, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads, message,
 };
@@ -190,7 +190,7 @@ fn text(error: impl std::error::Error) -> String {
 /// All that an environment can write, with fixed seeds.
 fn config(spec: &EnvSpec, num_envs: usize) -> PoolConfig {
     let seeding = Seeding::Continue { seed: Some(0) };
-    PoolConfig::new(spec.id, num_envs).features(!spec.features.is_empty()).seeding(seeding)
+    PoolConfig::new(spec.id, num_envs).features(!spec.features.is_empty()).state(true).seeding(seeding)
 }
 
 /// Fails at the first step after which two games differ.
@@ -321,6 +321,18 @@ pub fn check_numbers<'a>(spec: &EnvSpec, batch: &Batch<'a>) -> Result<(), String
     let bounds = f64::from(least)..=f64::from(largest);
     if let Some(number) = batch.ground_truth().iter().find(|number| !bounds.contains(number)) {
         return Err(format!("a number of the ground truth is {number}"));
+    }
+    let width = spec.markov_state.iter().map(StatePart::width).sum::<usize>().max(1);
+    let rows = |section: &'a [f32]| section.chunks_exact(width).enumerate();
+    let ended = rows(batch.final_state()).filter(|(env, _)| batch.has_ended(*env));
+    for (_, mut row) in rows(batch.state()).chain(ended) {
+        for part in spec.markov_state {
+            let (numbers, rest) = row.split_at(part.width());
+            if !part.contains(numbers) {
+                return Err(format!("the state `{}`, {numbers:?}, is not in its space", part.name));
+            }
+            row = rest;
+        }
     }
     for (env, row) in batch.info().chunks_exact(spec.info.len().max(1)).enumerate() {
         let wrong =

@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use serde::{Deserialize, Serialize};
 
-use crate::envs::{ActionSpace, Column, EnvSpec, InfoColumn, ResetParameters, Task, TaskEnv, Transition};
+use crate::envs::{ActionSpace, Column, EnvSpec, InfoColumn, ResetParameters, StatePart, Task, TaskEnv, Transition};
 use crate::pool::Registry;
 use crate::random::Generator;
 use crate::raster::{Canvas, FrameShape, Rect};
@@ -20,6 +20,7 @@ const FRAME: Option<FrameShape> = Some(FrameShape::rgb(84, 84));
 const FEATURES: &[Column] =
     &[Column { name: "x", description: "column" }, Column { name: "steps", description: "steps" }];
 const GROUND_TRUTH: &[Column] = &[Column { name: "x", description: "column, in 0..=1" }];
+const STATE: &[StatePart] = &[StatePart::integer("x", 100, "column")];
 const INFO: &[InfoColumn] = &[InfoColumn { name: "x", is_integer: true, description: "last column" }];
 
 impl Task for Toy {
@@ -31,6 +32,7 @@ impl Task for Toy {
             frame: FRAME,
             features: FEATURES,
             ground_truth: GROUND_TRUTH,
+            markov_state: STATE,
             info: INFO,
             ..EnvSpec::new("Toy-v0", "Leave", space)
         }
@@ -58,6 +60,10 @@ impl Task for Toy {
 
     fn ground_truth(&self, _: &(), out: &mut [f64]) {
         out[0] = f64::from(self.x) / 84.0;
+    }
+
+    fn markov_state(&self, _: &(), out: &mut [f32]) {
+        out[0] = self.x as f32;
     }
 
     fn info(&self, _: &(), out: &mut [f64]) {

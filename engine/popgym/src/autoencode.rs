@@ -1,13 +1,13 @@
 //! Autoencode: watch a deck, then name its suits in reverse order.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
-use crate::ids::{SUITS, ids, place};
+use crate::ids::{INTEGER_ZERO, SUITS, ids, place, shape};
 
 const IDS: [&str; 3] = ids!("Autoencode");
 const DECKS: [usize; 3] = [1, 2, 3];
@@ -44,12 +44,22 @@ impl Task for Autoencode {
                 ObservationSpace::Discrete(2),
                 ObservationSpace::Discrete(4),
             ])),
+            types: INTEGER_ZERO,
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
         }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        IDS.map(|id| EnvSpec { id, ..Self::spec() }).into()
+        let spec = |(id, decks): (_, usize)| {
+            let suits = "suits of the deck, 0 to 3, from the card that is dealt last";
+            let state = vec![
+                StatePart::integers("deck", 4, shape(&[decks * DECK]), "int64", suits),
+                StatePart::integer("mode", 2, "1 while the agent watches, 0 when it names suits"),
+                StatePart::shares("left", &[1], "share of the deck that has been dealt and not named"),
+            ];
+            EnvSpec { id, markov_state: state.leak(), ..Self::spec() }
+        };
+        IDS.into_iter().zip(DECKS).map(spec).collect()
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
@@ -70,9 +80,10 @@ impl Task for Autoencode {
         }
         // The last card dealt is the first of the deck. After the end, only the last remains to be named.
         let last = parameters.decks * DECK - 1;
-        let correct = action[0] == i32::from(self.deck.cards()[self.named]);
-        let terminated = self.named == last;
-        self.named = last.min(self.named + 1);
+        let named = last.min(self.named);
+        let correct = action[0] == i32::from(self.deck.cards()[named]);
+        let terminated = named == last;
+        self.named = named + 1;
         self.card = 0;
         Transition {
             reward: if correct { parameters.reward } else { -parameters.reward },
@@ -86,10 +97,19 @@ impl Task for Autoencode {
         out[1] = self.card.into();
     }
 
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        let cards = self.deck.cards();
+        let (deck, rest) = out.split_at_mut(cards.len());
+        deck.iter_mut().zip(cards).for_each(|(out, card)| *out = (*card).into());
+        rest[0] = if self.deck.left() > 0 { 1.0 } else { 0.0 };
+        let held = parameters.decks * DECK - self.deck.left() - self.named;
+        rest[1] = (held as f64 / cards.len() as f64) as f32;
+    }
+
     fn is_valid(&self, parameters: &Parameters) -> bool {
         let last = if self.named == 0 { Some(self.card) } else { self.deck.dealt(0) };
         self.deck.is_valid(parameters.decks, Face::Suit, last)
-            && self.named < parameters.decks * DECK
+            && self.named <= parameters.decks * DECK
             && (self.named == 0 || self.deck.left() == 0 && self.card == 0)
     }
 

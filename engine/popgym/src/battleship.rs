@@ -3,12 +3,12 @@
 use std::array;
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, place};
+use crate::ids::{ids, place, shape};
 
 const IDS: [&str; 3] = ids!("Battleship");
 const SIZES: [usize; 3] = [8, 10, 12];
@@ -84,8 +84,16 @@ impl Task for Battleship {
         let spec = |(id, size): (_, usize)| {
             let summary = "Find hidden ships; a shot only says whether it hit";
             let actions = ActionSpace::MultiDiscrete(vec![size as i32; 2].into());
+            let board = shape(&[size, size]);
+            let state = vec![
+                StatePart::integers("ships", 2, board, "int8", "1 where a ship is"),
+                StatePart::integers("shots", 2, board, "int8", "1 where the agent has shot"),
+                StatePart::integer("hit", 2, "1 if the last shot hit, otherwise 0"),
+            ];
             EnvSpec {
                 features: FEATURES,
+                markov_state: state.leak(),
+                needs_previous_action: true,
                 observation_space: Some(ObservationSpace::Discrete(2)),
                 ..EnvSpec::new(id, summary, actions)
             }
@@ -121,6 +129,14 @@ impl Task for Battleship {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = f32::from(u8::from(self.is_hit));
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        let boards = [self.ships, self.shots];
+        let rows = boards.iter().flat_map(|board| &board[..parameters.size]);
+        let squares = rows.flat_map(|row| (0..parameters.size).map(move |column| row >> column & 1));
+        let last = squares.chain([self.is_hit.into()]);
+        out.iter_mut().zip(last).for_each(|(out, bit)| *out = bit.into());
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

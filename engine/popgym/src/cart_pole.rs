@@ -3,8 +3,8 @@
 use std::f64::consts::PI;
 
 use endless_gym_core::envs::{
-    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, Parameter, ResetParameters, Task,
-    Transition,
+    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, Parameter, ResetParameters,
+    StatePart, StateSpace, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
@@ -125,6 +125,16 @@ impl Task for CartPole {
         const BOUNDED: ObservationSpace = ObservationSpace::Box { low: &[-HIGH[0], -HIGH[1]], high: &HIGH };
         const UNBOUNDED: ObservationSpace =
             ObservationSpace::Box { low: &[f32::NEG_INFINITY; 2], high: &[f32::INFINITY; 2] };
+        const STATE: &[StatePart] = &[StatePart {
+            name: "motion",
+            description: "position of the cart, m, its velocity, m/s, angle of the pole, rad, its angular velocity, rad/s",
+            space: StateSpace::Box {
+                low: &[-HIGH[0], f32::NEG_INFINITY, -HIGH[1], f32::NEG_INFINITY],
+                high: &[HIGH[0], f32::INFINITY, HIGH[1], f32::INFINITY],
+            },
+            shape: &[4],
+            dtype: "float32",
+        }];
         let families = [
             ("Balance a pole, seeing only positions", POSITIONS, BOUNDED),
             ("Balance a pole, seeing only velocities", VELOCITIES, UNBOUNDED),
@@ -135,6 +145,7 @@ impl Task for CartPole {
                 actions: ACTIONS,
                 features,
                 observation_space: Some(space),
+                markov_state: STATE,
                 parameters: PARAMETERS,
                 render_fps: 50,
                 ..EnvSpec::new(id, summary, ActionSpace::Discrete(2))
@@ -179,6 +190,10 @@ impl Task for CartPole {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out.copy_from_slice(&self.observation);
+    }
+
+    fn markov_state(&self, _: &Parameters, out: &mut [f32]) {
+        out.copy_from_slice(&[self.x, self.velocity, self.angle, self.angular_velocity].map(|number| number as f32));
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -1,11 +1,13 @@
 //! Concentration: turn over two cards at a time, and find the pairs.
 
-use endless_gym_core::envs::{ActionSpace, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition};
+use endless_gym_core::envs::{
+    ActionSpace, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, StateSpace, Task, Transition,
+};
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
-use crate::ids::{ids, numbered, place};
+use crate::ids::{INTEGER_ZERO, ids, numbered, place, shape};
 
 const IDS: [&str; 3] = ids!("Concentration");
 const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Colour), (1, Face::Rank)];
@@ -81,8 +83,25 @@ impl Task for Concentration {
             let summary = "Turn over two cards at a time, and find the pairs";
             let faces = vec![face.count() as i32 + 1; cards].leak();
             let features = numbered("card", cards, description);
+            let deck = shape(&[cards]);
+            let turned = "a card that the last step showed; without one the number of faces";
+            let state = vec![
+                StatePart::integers("faces", face.count() as i32, deck, "int64", "the cards' colours or ranks"),
+                StatePart {
+                    name: "found",
+                    description: "1 for cards of found pairs",
+                    space: StateSpace::Binary,
+                    shape: deck,
+                    dtype: "int8",
+                },
+                StatePart::integer("first", cards as i32, turned),
+                StatePart::integer("second", cards as i32, turned),
+            ];
             EnvSpec {
                 features,
+                markov_state: state.leak(),
+                needs_previous_action: true,
+                types: INTEGER_ZERO,
                 observation_space: Some(ObservationSpace::MultiDiscrete(faces)),
                 ..EnvSpec::new(id, summary, ActionSpace::Discrete(cards as i32))
             }
@@ -141,6 +160,23 @@ impl Task for Concentration {
         for (out, card) in out.iter_mut().zip(&self.view) {
             *out = (*card).into();
         }
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        let cards = self.deck.cards();
+        let (faces, rest) = out.split_at_mut(cards.len());
+        let (found, turned) = rest.split_at_mut(cards.len());
+        faces.iter_mut().zip(cards).for_each(|(out, card)| *out = (*card).into());
+        found.iter_mut().zip(0..).for_each(|(out, card)| *out = self.is_found(card).into());
+        let [first, second] = self.shown;
+        let none = parameters.face.count() as u8;
+        let shown = match self.first {
+            None if self.steps == 0 => [none; 2],
+            // A card of a found pair ends its turn at once.
+            None if first != second || !self.is_found(first) => [first, second],
+            _ => [first, none],
+        };
+        turned.copy_from_slice(&shown.map(f32::from));
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -1,13 +1,13 @@
 //! Count Recall: count the cards of each kind, and say how many of the queried kind there have been.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
-use crate::ids::{ids, numbered, place};
+use crate::ids::{ids, numbered, place, shape};
 
 const IDS: [&str; 3] = ids!("CountRecall");
 const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Suit), (4, Face::Rank)];
@@ -69,8 +69,21 @@ impl Task for CountRecall {
             let ground_truth = numbered("counts", face.count(), "number of cards of the kind so far");
             let kinds = vec![face.count() as i32; 2].leak();
             let actions = ActionSpace::Discrete(most as i32 + 1);
+            let each = shape(&[face.count()]);
+            let state = vec![
+                StatePart::shares("dealt", each, "share of the cards of each kind that has been dealt"),
+                StatePart::shares("queried", each, "share of the queries for each kind that has been asked"),
+                StatePart::integers(
+                    "shown",
+                    face.count() as i32,
+                    &[2],
+                    "int64",
+                    "the kinds of the card and of the query",
+                ),
+            ];
             EnvSpec {
                 features: FEATURES,
+                markov_state: state.leak(),
                 observation_space: Some(ObservationSpace::MultiDiscrete(kinds)),
                 ground_truth,
                 ground_truth_is_integer: true,
@@ -108,6 +121,16 @@ impl Task for CountRecall {
         for (out, count) in out.iter_mut().zip(self.counts) {
             *out = count.into();
         }
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        let kinds = parameters.face.count();
+        let most = (parameters.decks * DECK / kinds) as f64;
+        let (dealt, rest) = out.split_at_mut(kinds);
+        let (queried, shown) = rest.split_at_mut(kinds);
+        self.cards.write_dealt(dealt, |count| count / most);
+        self.queries.write_dealt(queried, |count| count / most);
+        shown.copy_from_slice(&[self.card, self.query].map(f32::from));
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -68,6 +68,15 @@ impl Deck {
         self.cards.get(self.left + ago).copied()
     }
 
+    /// Writes how many cards of each face have been dealt, as `share(number)`.
+    pub fn write_dealt(&self, out: &mut [f32], share: impl Fn(f64) -> f64) {
+        let mut counts = [0.0; DECK];
+        self.cards[self.left..].iter().for_each(|card| counts[usize::from(*card)] += 1.0);
+        for (out, count) in out.iter_mut().zip(counts) {
+            *out = share(count) as f32;
+        }
+    }
+
     /// Number of cards that have not been dealt.
     pub fn left(&self) -> usize {
         self.left

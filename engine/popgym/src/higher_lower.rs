@@ -1,13 +1,14 @@
 //! Higher Lower: guess whether the next card has a higher or a lower rank.
 
 use endless_gym_core::envs::{
-    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task,
+    Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
-use crate::ids::{ids, place};
+use crate::ids::{INTEGER_ZERO, ids, place};
 
 const IDS: [&str; 3] = ids!("HigherLower");
 const DECKS: [usize; 3] = [1, 2, 3];
@@ -48,6 +49,8 @@ impl Task for HigherLower {
             &[Column { name: "rank", description: "the rank of the card, from 0, the ace, to 12, the king" }];
         const GROUND_TRUTH: &[Column] =
             &[Column { name: "suit", description: "the suit of the card: spades, diamonds, clubs, hearts" }];
+        const STATE: &[StatePart] =
+            &[StatePart::shares("dealt", &[13], "share of the cards of each rank that has been dealt")];
         let summary = "Guess whether the next card has a higher or a lower rank";
         EnvSpec {
             actions: ACTIONS,
@@ -55,6 +58,8 @@ impl Task for HigherLower {
             observation_space: Some(ObservationSpace::Discrete(13)),
             ground_truth: GROUND_TRUTH,
             ground_truth_is_integer: true,
+            markov_state: STATE,
+            types: INTEGER_ZERO,
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(2))
         }
     }
@@ -93,6 +98,12 @@ impl Task for HigherLower {
 
     fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {
         out[0] = (self.card % 4).into();
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        let mut ranks = [0.0; 13];
+        self.deck.cards()[self.deck.left()..].iter().for_each(|card| ranks[usize::from(card / 4)] += 1.0);
+        out.copy_from_slice(&ranks.map(|count| (count / 4.0 / parameters.decks as f64) as f32));
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

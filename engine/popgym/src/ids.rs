@@ -1,6 +1,6 @@
 //! Names that several families share.
 
-use endless_gym_core::envs::{ActionBranch, Choice, Column};
+use endless_gym_core::envs::{ActionBranch, Choice, Column, OriginalTypes, RewardType};
 
 /// The ids of a family: easy, medium, hard.
 macro_rules! ids {
@@ -29,6 +29,15 @@ pub const SUITS: &[ActionBranch] = &[ActionBranch {
         Choice { name: "hearts", description: "names hearts" },
     ],
 }];
+
+/// The types of the families whose rewards of 0 are integers.
+pub const INTEGER_ZERO: OriginalTypes =
+    OriginalTypes { integers: "int64", reward: RewardType::IntegerZero, numpy_floats: &[] };
+
+/// The shape of a part of the state, which is never freed.
+pub fn shape(sizes: &[usize]) -> &'static [usize] {
+    sizes.to_vec().leak()
+}
 
 /// Columns with numbered names. Their text is never freed, so a registry makes them once.
 pub fn numbered(name: &str, count: usize, description: &'static str) -> &'static [Column] {

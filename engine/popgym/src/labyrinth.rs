@@ -3,12 +3,13 @@
 use std::collections::HashSet;
 
 use endless_gym_core::envs::{
-    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, OriginalTypes, ResetParameters,
+    RewardType, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, numbered, place};
+use crate::ids::{ids, numbered, place, shape};
 use crate::maze::{Maze, Place, connected};
 
 const IDS: [[&str; 3]; 2] = [ids!("LabyrinthEscape"), ids!("LabyrinthExplore")];
@@ -24,6 +25,7 @@ const FREE: f32 = 0.0;
 const WALL: f32 = 1.0;
 const START: f32 = 2.0;
 const GOAL: f32 = 3.0;
+const HIDDEN: f32 = 4.0;
 
 /// The maze's size and the agent's task.
 pub struct Parameters {
@@ -130,9 +132,17 @@ impl Task for Labyrinth {
             "Find the exit of a maze, seeing only the squares around",
             "Explore a maze, seeing only the squares around",
         ];
-        let specs = IDS.into_iter().zip(summaries).flat_map(|(ids, summary)| {
+        let states = CELLS.map(|cells| -> &[StatePart] {
+            let squares = "the maze, row by row: 0 free, 1 wall, 2 start, 3 exit; 4 where the agent has not been";
+            vec![StatePart::integers("maze", 5, shape(&[2 * cells + 1; 2]), "int8", squares)].leak()
+        });
+        let rewards = [RewardType::Float, RewardType::NumpyFloatIfPositive];
+        let specs = IDS.into_iter().zip(summaries).zip(rewards).flat_map(|((ids, summary), reward)| {
             let features: &'static [Column] = features;
-            ids.map(|id| EnvSpec {
+            ids.into_iter().zip(states).map(move |(id, markov_state)| EnvSpec {
+                markov_state,
+                needs_previous_action: true,
+                types: OriginalTypes { integers: "int32", reward, ..OriginalTypes::default() },
                 actions: ACTIONS,
                 features,
                 observation_space: Some(SPACE),
@@ -198,6 +208,15 @@ impl Task for Labyrinth {
     fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {
         out[0] = self.position.column as f64;
         out[1] = self.position.row as f64;
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        let size = self.maze.size();
+        for (number, out) in out.iter_mut().enumerate() {
+            let place = Place { row: number / size, column: number % size };
+            let is_explored = self.explored[place.row] >> place.column & 1 == 1;
+            *out = if is_explored { self.square(place, parameters.escapes) } else { HIDDEN };
+        }
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

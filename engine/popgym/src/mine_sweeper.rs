@@ -1,12 +1,12 @@
 //! Mine Sweeper: view all squares without a mine; a viewed square says how many mines are around it.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, place};
+use crate::ids::{ids, place, shape};
 
 const IDS: [&str; 3] = ids!("MineSweeper");
 /// The board's size, and the number of mines.
@@ -68,8 +68,12 @@ impl Task for MineSweeper {
         let spec = |(id, (size, mines)): (_, (usize, usize))| {
             let summary = "View all squares without a mine; a viewed square says how many mines are around it";
             let actions = ActionSpace::MultiDiscrete(vec![size as i32; 2].into());
+            let squares = "the squares, row by row: 0 not viewed, 1 a mine, 2 viewed";
+            let state = vec![StatePart::integers("board", 3, shape(&[size * size]), "int8", squares)];
             EnvSpec {
                 features: FEATURES,
+                markov_state: state.leak(),
+                needs_previous_action: true,
                 observation_space: Some(ObservationSpace::Discrete(mines.min(9) as i32 + 1)),
                 ..EnvSpec::new(id, summary, actions)
             }
@@ -111,6 +115,12 @@ impl Task for MineSweeper {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = self.count.into();
+    }
+
+    fn markov_state(&self, _: &Parameters, out: &mut [f32]) {
+        for (square, out) in out.iter_mut().enumerate() {
+            *out = if self.mines >> square & 1 == 1 { 1.0 } else { 2.0 * f32::from(self.viewed >> square & 1 == 1) };
+        }
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

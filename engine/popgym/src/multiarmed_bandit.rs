@@ -1,12 +1,12 @@
 //! Multiarmed Bandit: find the arms that pay best.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, numbered, place};
+use crate::ids::{ids, numbered, place, shape};
 
 const IDS: [&str; 3] = ids!("MultiarmedBandit");
 /// Arms, and the length of an episode.
@@ -39,8 +39,11 @@ impl Task for MultiarmedBandit {
 
     fn specs() -> Vec<EnvSpec> {
         const FEATURES: &[Column] = &[Column { name: "paid", description: "1 if the last arm paid, otherwise 0" }];
+        let state = |arms| StatePart::shares("bandits", shape(&[arms]), "probability that each arm pays");
         let spec = |(id, (arms, _)): (_, (usize, _))| EnvSpec {
             features: FEATURES,
+            markov_state: vec![state(arms)].leak(),
+            needs_previous_action: true,
             observation_space: Some(ObservationSpace::Discrete(2)),
             ground_truth: numbered("bandits", arms, "probability that the arm pays"),
             ..EnvSpec::new(id, "Find the arms that pay best", ActionSpace::Discrete(arms as i32))
@@ -74,6 +77,10 @@ impl Task for MultiarmedBandit {
         for (out, arm) in out.iter_mut().zip(&self.arms) {
             *out = f64::from(*arm);
         }
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        out.copy_from_slice(&self.arms[..parameters.arms]);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -4,7 +4,8 @@ use std::f64::consts::PI;
 use std::hint::black_box;
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, Parameter, ResetParameters, Task, Transition, box_action,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, OriginalTypes, Parameter, ResetParameters, RewardType,
+    StatePart, StateSpace, Task, Transition, box_action,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
@@ -86,10 +87,20 @@ impl Task for Pendulum {
             Column { name: "cos", description: "cosine of the angle from the upright position" },
             Column { name: "sin", description: "sine of the angle" },
         ];
+        const STATE: &[StatePart] = &[StatePart {
+            name: "motion",
+            description: "cosine and sine of the angle from the upright position, angular velocity, rad/s",
+            space: StateSpace::Box { low: &[-1.0, -1.0, -MAX_SPEED as f32], high: &[1.0, 1.0, MAX_SPEED as f32] },
+            shape: &[3],
+            dtype: "float32",
+        }];
+        let types = OriginalTypes { reward: RewardType::NumpyFloat, ..OriginalTypes::default() };
         let summaries =
             ["Swing a pendulum up, seeing only its angle", "Swing a pendulum up, seeing only its angle, with noise"];
         let specs = IDS.into_iter().zip(summaries).flat_map(|(ids, summary)| {
             ids.map(|id| EnvSpec {
+                markov_state: STATE,
+                types,
                 features: FEATURES,
                 observation_space: Some(ObservationSpace::Box { low: &[-1.0; 2], high: &[1.0; 2] }),
                 parameters: PARAMETERS,
@@ -132,6 +143,10 @@ impl Task for Pendulum {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out.copy_from_slice(&self.observation);
+    }
+
+    fn markov_state(&self, _: &Parameters, out: &mut [f32]) {
+        out.copy_from_slice(&[self.angle.cos(), self.angle.sin(), self.velocity].map(|number| number as f32));
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

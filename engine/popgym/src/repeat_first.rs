@@ -1,7 +1,7 @@
 //! Repeat First: name the suit of the first card, step after step.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
@@ -31,11 +31,16 @@ impl Task for RepeatFirst {
 
     fn spec() -> EnvSpec {
         const FEATURES: &[Column] = &[Column { name: "suit", description: "the suit of the card, 0 to 3" }];
+        const STATE: &[StatePart] = &[
+            StatePart::integers("first", 4, &[], "int64", "the suit of the first card, 0 to 3"),
+            StatePart::shares("left", &[4], "share of the cards of each suit that has not been dealt"),
+        ];
         let summary = "Name the suit of the first card";
         EnvSpec {
             actions: SUITS,
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(4)),
+            markov_state: STATE,
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
         }
     }
@@ -64,6 +69,12 @@ impl Task for RepeatFirst {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = self.card.into();
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        out[0] = self.first.into();
+        let each = (parameters.decks * DECK) as f64 / 4.0;
+        self.deck.write_dealt(&mut out[1..], |count| 1.0 - count / each);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

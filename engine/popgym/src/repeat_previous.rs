@@ -3,13 +3,13 @@
 use std::collections::VecDeque;
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
-use crate::ids::{SUITS, ids, place};
+use crate::ids::{INTEGER_ZERO, SUITS, ids, place, shape};
 
 const IDS: [&str; 3] = ids!("RepeatPrevious");
 /// Number of decks, and which card to name: 1 is the card that is shown.
@@ -39,12 +39,21 @@ impl Task for RepeatPrevious {
             actions: SUITS,
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(4)),
+            types: INTEGER_ZERO,
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
         }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        IDS.map(|id| EnvSpec { id, ..Self::spec() }).into()
+        let spec = |(id, (_, k)): (_, (_, usize))| {
+            let suits = "the last suits that were shown, the oldest first; 0 before the first card";
+            let state = vec![
+                StatePart::integers("suits", 4, shape(&[k]), "int64", suits),
+                StatePart::shares("left", &[4], "share of the cards of each suit that has not been dealt"),
+            ];
+            EnvSpec { id, markov_state: state.leak(), ..Self::spec() }
+        };
+        IDS.into_iter().zip(VARIANTS).map(spec).collect()
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
@@ -70,6 +79,15 @@ impl Task for RepeatPrevious {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = self.card.into();
+    }
+
+    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
+        let (suits, left) = out.split_at_mut(parameters.k);
+        for (ago, out) in suits.iter_mut().rev().enumerate() {
+            *out = self.deck.dealt(ago).unwrap_or_default().into();
+        }
+        let each = (parameters.decks * DECK) as f64 / 4.0;
+        self.deck.write_dealt(left, |count| 1.0 - count / each);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -66,6 +66,7 @@ def checked_arguments(
     observation: ObservationName | None,
     frames: Frames | None,
     independent_episodes: bool,
+    state: bool,
     first_env: int,
     total_envs: int | None,
 ) -> Arguments:
@@ -76,6 +77,8 @@ def checked_arguments(
         ValueError: An argument is out of its range.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
+    if state and not described.markov_state:
+        raise ValueError(f"state must be False, since {described.id} does not tell its Markov state")
     num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
     groups = integer("groups", groups, 1, _native.MAX_GROUPS)
     threads = integer("num_threads", num_threads or 0, 0, _native.MAX_THREADS)
@@ -95,6 +98,7 @@ def checked_arguments(
             "independent_episodes": bool(independent_episodes),
             "frames": frames.configuration() if frames else None,
             "features": features,
+            "state": bool(state),
             # Environments are numbered over all groups.
             "first_env": first_env + group * num_envs,
             "total_envs": total_envs,

@@ -31,6 +31,7 @@ class Results:
         num_envs: Environments of a batch.
         observation_space: The space of one environment's observation.
         copy: Whether all arrays are writable copies.
+        state_space: The space of one environment's Markov state; `None` if `info` does not have it.
         has_final_observation: Whether `info` has the last observation of an episode that ended.
     """
 
@@ -50,7 +51,8 @@ class Results:
         self._final_observed = self._places("final_")
         self.has_final_observation = bool(self._final_observed)
         self.observation_space = described.observation_space(frames, "features" in self._index)
-        self._truth = self._index.get("ground_truth")
+        self._infos = [(name, self._index[name]) for name in ("ground_truth", "state") if name in self._index]
+        self.state_space = described.state_space() if "state" in self._index else None
         self._steps = [self._index[name] for name in ("reward", "terminated", "truncated")]
         self._ends = [self._index[name] for name in ("episode_return", "episode_length", "info")]
         self._integers = [is_integer for _, is_integer in described.info]
@@ -89,9 +91,10 @@ class Results:
         return parts if len(parts) > 1 else next(iter(parts.values()))
 
     def _info(self, arrays: _native.Arrays) -> dict[str, Any]:
-        if self._truth is None:
-            return {}
-        return {"ground_truth": arrays[self._truth], "_ground_truth": self._all.copy() if self.copy else self._all}
+        info: dict[str, Any] = {}
+        for name, place in self._infos:
+            info[name], info[f"_{name}"] = arrays[place], self._all.copy() if self.copy else self._all
+        return info
 
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
         """Adds the infos of the episodes that this step ended, if it ended any."""
@@ -106,9 +109,9 @@ class Results:
         if not self._same_step:
             info.update(final)
             return
-        if "final_ground_truth" in self._index:
-            final["ground_truth"] = np.where(ended[:, None], arrays[self._index["final_ground_truth"]], 0.0)
-            final["_ground_truth"] = ended
+        for name, _ in self._infos:
+            if (place := self._index.get(f"final_{name}")) is not None:
+                final[name], final[f"_{name}"] = np.where(ended[:, None], arrays[place], 0), ended
         info["final_info"], info["_final_info"] = final, ended
         if not self.has_final_observation:
             return

@@ -7,7 +7,7 @@ use super::*;
 use crate::toy::toys;
 
 fn layout(num_envs: usize) -> Layout {
-    let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
+    let contents = Contents { frames: Some(Frames::default()), features: true, state: false, final_observation: true };
     batch_layout(toys().spec("Toy-v0").unwrap(), num_envs, contents).unwrap()
 }
 
@@ -209,6 +209,7 @@ proptest! {
         let contents = Contents {
             frames: (options & 1 != 0).then(Frames::default),
             features: options & 2 != 0,
+            state: options & 4 != 0,
             final_observation: options & 4 != 0,
         };
         let layout = batch_layout(spec, num_envs, contents).unwrap();

@@ -407,7 +407,7 @@ mod tests {
     use crate::toy::toys;
 
     fn everything() -> Contents {
-        Contents { frames: Some(Frames::default()), features: true, final_observation: true }
+        Contents { frames: Some(Frames::default()), features: true, state: true, final_observation: true }
     }
 
     fn layout(num_envs: usize) -> Layout {

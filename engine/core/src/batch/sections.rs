@@ -4,7 +4,7 @@ use std::fmt;
 
 use super::dtype::{Dtype, Element, Sealed};
 use super::frames::Frames;
-use crate::envs::{ActionSpace, EnvSpec};
+use crate::envs::{ActionSpace, EnvSpec, StatePart};
 
 /// Maximum length of a message's reset parameters, in bytes of JSON text.
 pub const OPTIONS_BYTES: usize = 16 * 1024;
@@ -196,6 +196,8 @@ macro_rules! batch_sections {
                 "the content of the frame as numbers, in the order of the environment's specification; on request";
             GroundTruth ground_truth: f64, Vector, optional,
                 "the ground truth, in the order of the environment's specification; only for ids that have one";
+            State state: f32, Vector, optional,
+                "the Markov state, in the order of the environment's specification; on request, only for ids that tell it";
             Reward reward: f64, Scalar, required,
                 "reward of this step";
             Terminated terminated: u8, Flag, required,
@@ -216,6 +218,8 @@ macro_rules! batch_sections {
                 "`features` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalGroundTruth final_ground_truth: f64, Vector, optional,
                 "`ground_truth` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
+            FinalState final_state: f32, Vector, optional,
+                "`state` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
         }
     };
 }
@@ -224,7 +228,7 @@ pub(super) use batch_sections;
 batch_sections! { section_table!
     /// A section of a batch, the memory that a step of a group of environments writes.
     ///
-    /// In same-step autoreset, `observation`, `vector_observation`, `features` and `ground_truth` belong to the new episode in a
+    /// In same-step autoreset, `observation`, `vector_observation`, `features`, `ground_truth` and `state` belong to the new episode in a
     /// step that ends one, while reward, flags, `episode_*` and `info` belong to the episode that ended.
     BatchSection, 1;
 }
@@ -251,6 +255,8 @@ pub struct Contents {
     pub frames: Option<Frames>,
     /// Whether to include the feature observation.
     pub features: bool,
+    /// Whether to include the Markov state.
+    pub state: bool,
     /// Whether to include the `final_*` sections, for same-step autoreset.
     pub final_observation: bool,
 }
@@ -267,6 +273,9 @@ impl BatchSection {
                 columns(spec.features.len()).filter(|_| contents.features || spec.frame.is_none())
             }
             BatchSection::GroundTruth => columns(spec.ground_truth.len()),
+            BatchSection::State => {
+                columns(spec.markov_state.iter().map(StatePart::width).sum()).filter(|_| contents.state)
+            }
             BatchSection::Reward
             | BatchSection::Terminated
             | BatchSection::Truncated
@@ -277,6 +286,7 @@ impl BatchSection {
             BatchSection::FinalVectorObservation => final_of(BatchSection::VectorObservation),
             BatchSection::FinalFeatures => final_of(BatchSection::Features),
             BatchSection::FinalGroundTruth => final_of(BatchSection::GroundTruth),
+            BatchSection::FinalState => final_of(BatchSection::State),
         }
     }
 }
@@ -314,7 +324,8 @@ mod tests {
     #[test]
     fn final_sections_equal_their_originals() {
         for spec in toys().specs() {
-            let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
+            let contents =
+                Contents { frames: Some(Frames::default()), features: true, state: true, final_observation: true };
             for section in BatchSection::ALL {
                 let Some(original) = section.name().strip_prefix("final_") else { continue };
                 let original = BatchSection::from_name(original).unwrap();
@@ -331,7 +342,7 @@ mod tests {
         for spec in toys().specs() {
             for stack in [1, 4] {
                 let frames = Some(Frames { stack, ..Frames::default() });
-                let contents = Contents { frames, features: true, final_observation: true };
+                let contents = Contents { frames, features: true, state: true, final_observation: true };
                 for section in BatchSection::ALL {
                     let shape = section.row_shape(spec, contents);
                     assert!(shape.iter().all(|shape| section.row().admits(shape)), "{section} {shape:?}");

@@ -79,6 +79,9 @@ pub trait Environment: Send + Sync {
     /// Writes the ground truth; an environment without one writes nothing.
     fn ground_truth(&self, _out: &mut [f64]) {}
 
+    /// Writes the Markov state; an environment that does not tell it writes nothing.
+    fn markov_state(&self, _out: &mut [f32]) {}
+
     /// The state, for a snapshot.
     fn state(&self) -> &Self::State;
 

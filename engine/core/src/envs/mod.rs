@@ -15,6 +15,7 @@ pub use expert::Expert;
 pub use parameters::{Parameter, ParameterError, ParameterKind, ResetParameters};
 pub use progress::Progress;
 pub use spec::{
-    ActionBranch, Choice, Column, EnvSpec, InfoColumn, Learnt, Metric, ObservationSpace, UnknownEnvironment,
+    ActionBranch, Choice, Column, EnvSpec, InfoColumn, Learnt, Metric, ObservationSpace, OriginalTypes, RewardType,
+    StatePart, StateSpace, UnknownEnvironment,
 };
 pub use task::{Task, TaskEnv};

@@ -156,6 +156,118 @@ impl fmt::Display for ObservationSpace {
     }
 }
 
+/// A part of the Markov state: what determines, together with the actions, how an episode continues.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct StatePart {
+    /// Name, unique within the environment.
+    pub name: &'static str,
+    /// Meaning and unit.
+    pub description: &'static str,
+    /// The space of each of its numbers.
+    pub space: StateSpace,
+    /// Its shape; empty for one number.
+    pub shape: &'static [usize],
+    /// Its type in a single environment of Python: a dtype of numpy, or `int` for an integer of Python.
+    pub dtype: &'static str,
+}
+
+impl StatePart {
+    /// An array of integers from 0 to less than `choices`.
+    pub const fn integers(
+        name: &'static str,
+        choices: i32,
+        shape: &'static [usize],
+        dtype: &'static str,
+        description: &'static str,
+    ) -> Self {
+        StatePart { name, description, space: StateSpace::Integers(choices), shape, dtype }
+    }
+
+    /// An integer of Python from 0 to less than `choices`.
+    pub const fn integer(name: &'static str, choices: i32, description: &'static str) -> Self {
+        StatePart::integers(name, choices, &[], "int", description)
+    }
+
+    /// A float32 array of numbers from 0 to 1.
+    pub const fn shares(name: &'static str, shape: &'static [usize], description: &'static str) -> Self {
+        let space = StateSpace::Box { low: &[0.0], high: &[1.0] };
+        StatePart { name, description, space, shape, dtype: "float32" }
+    }
+
+    /// How many numbers it has.
+    pub fn width(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether numbers are in its space.
+    pub fn contains(&self, numbers: &[f32]) -> bool {
+        let is_choice = |number: &f32, choices: i32| number.fract() == 0.0 && (0.0..choices as f32).contains(number);
+        numbers.len() == self.width()
+            && match self.space {
+                StateSpace::Integers(choices) => numbers.iter().all(|number| is_choice(number, choices)),
+                StateSpace::Binary => numbers.iter().all(|number| is_choice(number, 2)),
+                StateSpace::Box { low, high } => numbers
+                    .iter()
+                    .zip(low.iter().cycle().zip(high.iter().cycle()))
+                    .all(|(number, (low, high))| (*low..=*high).contains(number)),
+            }
+    }
+}
+
+/// Space of a part of the Markov state.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub enum StateSpace {
+    /// Integers from 0 to less than this number: Gymnasium's `Discrete` for one, otherwise `MultiDiscrete`.
+    Integers(i32),
+    /// Zeros and ones, Gymnasium's `MultiBinary`.
+    Binary,
+    /// Numbers, float32.
+    Box {
+        /// The lower bound of all numbers, or of each.
+        low: &'static [f32],
+        /// The upper bound of all numbers, or of each.
+        high: &'static [f32],
+    },
+}
+
+/// The types of a Python class that an environment reproduces, where they are not those of its spaces. The default is right for all
+/// other environments.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct OriginalTypes {
+    /// numpy's dtype of arrays of integers in observations.
+    pub integers: &'static str,
+    /// The type of rewards.
+    pub reward: RewardType,
+    /// The names of the final infos that are floats of numpy.
+    pub numpy_floats: &'static [&'static str],
+}
+
+impl Default for OriginalTypes {
+    fn default() -> Self {
+        OriginalTypes::DEFAULT
+    }
+}
+
+impl OriginalTypes {
+    const DEFAULT: OriginalTypes = OriginalTypes { integers: "int64", reward: RewardType::Float, numpy_floats: &[] };
+}
+
+/// The type of a Python class's rewards.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RewardType {
+    /// A float.
+    Float,
+    /// A float of numpy.
+    NumpyFloat,
+    /// A float of numpy if it is positive, otherwise a float.
+    NumpyFloatIfPositive,
+    /// A float; 0 is an integer.
+    IntegerZero,
+    /// A float; 0 is an integer, except in the step that ends the episode.
+    IntegerZeroUntilEnd,
+}
+
 /// Everything that is fixed about an environment id.
 #[derive(Clone, Debug, Serialize)]
 pub struct EnvSpec {
@@ -177,12 +289,18 @@ pub struct EnvSpec {
     pub ground_truth_is_integer: bool,
     /// The least and the largest number of the ground truth; `None` if it has no bounds.
     pub ground_truth_bounds: Option<(f32, f32)>,
+    /// The parts of the Markov state, float32 in a batch that is to have it; empty if the environment does not tell it.
+    pub markov_state: &'static [StatePart],
     /// Columns of the final info in addition to `reward` and `length`.
     pub info: &'static [InfoColumn],
     /// Columns of the feature observation (float32).
     pub features: &'static [Column],
     /// What the features stand for; `None` for a box without bounds.
     pub observation_space: Option<ObservationSpace>,
+    /// Whether the best policy needs the previous action, which the observation does not show.
+    pub needs_previous_action: bool,
+    /// Types of the Python class that the environment reproduces.
+    pub types: OriginalTypes,
     /// Whether an episode may show what earlier ones left. [`PoolConfig::independent_episodes`] prevents it.
     ///
     /// [`PoolConfig::independent_episodes`]: crate::pool::PoolConfig::independent_episodes
@@ -216,9 +334,12 @@ impl EnvSpec {
             ground_truth: &[],
             ground_truth_is_integer: false,
             ground_truth_bounds: None,
+            markov_state: &[],
             info: &[],
             features: &[],
             observation_space: None,
+            needs_previous_action: false,
+            types: OriginalTypes::DEFAULT,
             keeps_state: false,
             parameters: &[],
             metric: Metric::RETURN,

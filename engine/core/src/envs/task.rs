@@ -116,6 +116,9 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
     /// Writes the ground truth, float64 in the order of [`EnvSpec::ground_truth`].
     fn ground_truth(&self, _parameters: &Self::Parameters, _out: &mut [f64]) {}
 
+    /// Writes the Markov state, float32 in the order of [`EnvSpec::markov_state`].
+    fn markov_state(&self, _parameters: &Self::Parameters, _out: &mut [f32]) {}
+
     /// Writes the final info, float64 in the order of [`EnvSpec::info`]. Valid after the step that ended the episode.
     fn info(&self, _parameters: &Self::Parameters, _out: &mut [f64]) {}
 
@@ -201,6 +204,10 @@ impl<T: Task> Environment for TaskEnv<T> {
 
     fn ground_truth(&self, out: &mut [f64]) {
         self.task.ground_truth(&self.parameters, out);
+    }
+
+    fn markov_state(&self, out: &mut [f32]) {
+        self.task.markov_state(&self.parameters, out);
     }
 
     fn state(&self) -> &T {

@@ -122,6 +122,9 @@ pub struct PoolConfig {
     /// Whether the batch has the feature observation.
     #[serde(default)]
     pub features: bool,
+    /// Whether the batch has the Markov state, if the environment tells it.
+    #[serde(default)]
+    pub state: bool,
     /// Whether to draw every frame a second time, in full, and compare; a difference is [`PoolError::WrongFrame`]. For tests.
     #[serde(default)]
     pub check_drawing: bool,
@@ -170,6 +173,7 @@ impl PoolConfig {
             independent_episodes: false,
             frames: default_frames(),
             features: false,
+            state: false,
             check_drawing: false,
             first_env: 0,
             total_envs: num_envs,
@@ -185,6 +189,7 @@ impl PoolConfig {
         independent_episodes: bool,
         frames: Option<Frames>,
         features: bool,
+        state: bool,
         check_drawing: bool,
         first_env: usize,
         total_envs: usize,
@@ -249,6 +254,7 @@ impl PoolConfig {
         Contents {
             frames: self.frames,
             features: self.features,
+            state: self.state,
             final_observation: self.final_observation && self.autoreset == Autoreset::SameStep,
         }
     }
@@ -315,6 +321,7 @@ mod tests {
             .independent_episodes(true)
             .frames(Some(Frames { format: PixelFormat { grayscale: true, ..PixelFormat::default() }, stack: 4 }))
             .features(true)
+            .state(true)
             .check_drawing(true)
             .first_env(3)
             .total_envs(7);

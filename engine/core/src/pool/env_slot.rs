@@ -153,6 +153,7 @@ impl<E: Environment> EnvSlot<E> {
         write_if_present(out.vector_observation.row(row), |r| self.env.vector_observation(r));
         write_if_present(out.features.row(row), |r| self.env.features(r));
         write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
+        write_if_present(out.state.row(row), |r| self.env.markov_state(r));
     }
 
     /// Updates the frames of the observation. `drawn` holds the scene that was last drawn into each frame.
@@ -188,6 +189,7 @@ impl<E: Environment> EnvSlot<E> {
         write_if_present(out.final_vector_observation.row(row), |r| self.env.vector_observation(r));
         write_if_present(out.final_features.row(row), |r| self.env.features(r));
         write_if_present(out.final_ground_truth.row(row), |r| self.env.ground_truth(r));
+        write_if_present(out.final_state.row(row), |r| self.env.markov_state(r));
     }
 }
 

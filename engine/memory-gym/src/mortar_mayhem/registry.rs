@@ -9,7 +9,7 @@ use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION,
 use std::sync::LazyLock;
 
 use crate::controls::{MOVE, TURN_AND_WALK, column, float, integer, max_steps, spec};
-use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Learnt, Metric, Parameter};
+use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Learnt, Metric, OriginalTypes, Parameter, RewardType};
 
 const AGENT_SCALE: Parameter = Parameter::float(
     "agent_scale",
@@ -114,10 +114,14 @@ const GROUND_TRUTH: &[Column] = &[
     column("target_y", "row of that tile, from the top, divided by 5"),
 ];
 
+const TYPES: OriginalTypes =
+    OriginalTypes { integers: "int64", reward: RewardType::IntegerZeroUntilEnd, numpy_floats: &["commands_completed"] };
+
 /// The five ids of the family.
 pub static IDS: LazyLock<[(EnvSpec, Variant); 5]> = LazyLock::new(|| {
     let finite = |id, summary, actions, parameters| EnvSpec {
         info: FINITE_INFO,
+        types: TYPES,
         features: FEATURES,
         parameters,
         metric: Metric::TASK_PROGRESS,
@@ -153,7 +157,7 @@ pub static IDS: LazyLock<[(EnvSpec, Variant); 5]> = LazyLock::new(|| {
         (EnvSpec { vector_observation, ..given }, Variant { commands_given: true, start_offset: true, ..variant }),
         (EnvSpec { vector_observation, render_fps: 1, ..given_grid }, Variant { commands_given: true, ..on_grid }),
         (
-            EnvSpec { ground_truth: GROUND_TRUTH, info: ENDLESS_INFO, keeps_state: true, ..endless },
+            EnvSpec { ground_truth: GROUND_TRUTH, info: ENDLESS_INFO, types: TYPES, keeps_state: true, ..endless },
             Variant { locomotion: Locomotion::Wrapping, endless: true, start_offset: true, ..variant },
         ),
     ]

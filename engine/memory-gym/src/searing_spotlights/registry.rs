@@ -8,7 +8,7 @@ use super::parameters::{MAX_AGENT_SCALE, MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIG
 use std::sync::LazyLock;
 
 use crate::controls::{MOVE, column, float, integer, max_steps, spec};
-use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, Parameter};
+use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, OriginalTypes, Parameter};
 
 const fn initial_spawns(default: i64) -> Parameter {
     Parameter::int("initial_spawns", default, 0, MAX_SPOTLIGHTS as i64, "Spotlights at the start of an episode.")
@@ -217,7 +217,8 @@ pub static IDS: LazyLock<[(EnvSpec, Variant); 2]> = LazyLock::new(|| {
     let endless = spec("Endless-SearingSpotlights-v0", summary, MOVE);
     let (features, keeps_state, ground_truth) = (FEATURES, true, GROUND_TRUTH);
     let (info, parameters, metric) = (FINITE_INFO, SEARING_SPOTLIGHTS, Metric::TASK_PROGRESS);
-    let finite = EnvSpec { info, features, keeps_state, parameters, metric, ..finite };
+    let types = OriginalTypes { numpy_floats: &["coins_collected"], ..OriginalTypes::default() };
+    let finite = EnvSpec { info, types, features, keeps_state, parameters, metric, ..finite };
     let (info, parameters) = (ENDLESS_INFO, ENDLESS_SEARING_SPOTLIGHTS);
     let metric = Metric { name: "coins_collected", label: "Coins" };
     let endless = EnvSpec { ground_truth, info, features, keeps_state, parameters, metric, learnt: None, ..endless };
