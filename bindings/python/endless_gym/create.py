@@ -82,6 +82,7 @@ def make_vec(
             episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with the
             last one's background, and an episode without a seed continues the generator of the previous one.
         state: Add `info["state"]`, the hidden Markov state, float32 (n, k), in environments that tell it: those of POPGym.
+            `endless_gym.popgym.Markovian` makes it a part of observations.
         first_env: Number of the first environment, for seeds, if the environments of one trainer are divided among several calls,
             for example one for each rank of a data-parallel run: environment `i` is numbered `first_env + i`.
         total_envs: Total number of environments of all these calls; `None` for `first_env` plus those of this call.

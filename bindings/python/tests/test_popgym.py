@@ -20,7 +20,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 import endless_gym
-from endless_gym.popgym import PreviousAction
+from endless_gym.popgym import DiscreteAction, Flatten, Markovian, Observability, PreviousAction
 from endless_gym.recording.episodes import Plan, play
 from endless_gym.recording.players import ExpertPlayer, Player, RandomPlayer
 
@@ -203,3 +203,114 @@ def test_random_actions_replace_those_of_an_expert_in_a_box() -> None:
     assert abs(random.mean()) < 0.3 and -2 <= random.min() < -1.8 and 1.8 < random.max() <= 2
     shares = [np.mean(actions(ExpertPlayer(described), rate) == random) for rate in (0.0, 0.5, 1.0)]
     assert shares[0] == 0 and 0.4 < shares[1] < 0.6 and shares[2] == 1
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two observations have the same types and numbers."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return original_states.checksum(one) == original_states.checksum(other)
+
+
+@pytest.mark.libraries
+@pytest.mark.parametrize("id", [id for id in IDS if "Easy" in id])
+def test_wrappers_are_those_of_popgym(id: str) -> None:
+    theirs = pytest.importorskip("popgym.wrappers")
+
+    def chains(of: Any) -> list[Any]:
+        chains: list[Any] = [
+            lambda env: of.Antialias(of.PreviousAction(env)),
+            lambda env: of.Flatten(of.Antialias(of.PreviousAction(env))),
+            lambda env: of.Flatten(of.Antialias(env)),
+            lambda env: of.Flatten(env),
+            *[lambda env, level=level: of.Markovian(env, level) for level in range(4)],
+        ]
+        if "Pendulum" not in id:
+            chains.append(of.DiscreteAction)
+        return chains
+
+    for ours, original in zip(chains(endless_gym.popgym), chains(theirs), strict=True):
+        env, wanted = ours(endless_gym.Env(id)), original(endless_gym.Env(id))
+        assert (env.observation_space, env.action_space) == (wanted.observation_space, wanted.action_space)
+        (given, info), (expected, expected_info) = env.reset(seed=3), wanted.reset(seed=3)
+        env.action_space.seed(1)
+        for _ in range(20):
+            assert same(given, expected) and info.keys() == expected_info.keys()
+            assert "state" not in info or same(info["state"], expected_info["state"])
+            action = env.action_space.sample()
+            given, _, terminated, truncated, info = env.step(action)
+            expected, _, _, _, expected_info = wanted.step(action)
+            if terminated or truncated:
+                break
+
+
+@pytest.mark.parametrize("level", list(Observability))
+@pytest.mark.parametrize("id", [id for id in IDS if "Easy" in id])
+def test_wrapped_batches_are_wrapped_environments(id: str, level: Observability) -> None:
+    def wrapped(env: Any) -> Any:
+        env = Flatten(PreviousAction(env)) if level is Observability.PARTIAL else Markovian(env, level)
+        return env if "Pendulum" in id else DiscreteAction(env)
+
+    envs, env = wrapped(endless_gym.make_vec(id, 1, autoreset="same_step", state=True)), wrapped(endless_gym.Env(id))
+    assert (envs.single_observation_space, envs.single_action_space) == (env.observation_space, env.action_space)
+
+    def numbers(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: numbers(part) for key, part in value.items()}
+        return (
+            [number for part in value for number in numbers(part)]
+            if isinstance(value, tuple)
+            else np.ravel(value).tolist()
+        )
+
+    (batch, _), (observation, _) = envs.reset(seed=3), env.reset(seed=3)
+    env.action_space.seed(1)
+    ended = False
+    while not ended:
+        assert numbers(batch) == numbers(observation) and envs.observation_space.contains(batch)
+        action = env.action_space.sample()
+        batch, *_, info = envs.step(np.asarray(action)[None])
+        observation, _, terminated, truncated, _ = env.step(action)
+        ended = terminated or truncated
+    assert numbers(info["final_obs"][0]) == numbers(observation)
+
+
+def test_wrappers_say_what_they_need() -> None:
+    with pytest.raises(ValueError, match="does not tell its Markov state; make it with state=True"):
+        Markovian(endless_gym.make_vec("popgym-RepeatFirstEasy-v0", 1), Observability.FULL)
+    with pytest.raises(ValueError, match="action space must be Discrete or MultiDiscrete, got Box"):
+        DiscreteAction(endless_gym.Env("popgym-PositionOnlyPendulumEasy-v0"))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_classes_of_the_original_are_its_ids(family: str) -> None:
+    name = family.replace("Cartpole", "CartPole")
+    base = getattr(endless_gym.popgym, name)
+    for level in ("Easy", "Medium", "Hard"):
+        env = getattr(endless_gym.popgym, name + level)()
+        assert isinstance(env, base) and isinstance(env, endless_gym.Env)
+        assert env.unwrapped._spec.id == f"popgym-{family}{level}-v0"
+        env.reset(seed=1)
+        again = pickle.loads(pickle.dumps(env))
+        assert type(again) is type(env) and same(again.get_state(), env.get_state())
+
+
+def test_the_original_s_arguments_choose_a_difficulty() -> None:
+    popgym = endless_gym.popgym
+    for env, id in [
+        (popgym.RepeatPrevious(k=32, num_decks=2), "RepeatPreviousMedium"),
+        (popgym.RepeatPrevious(), "RepeatPreviousEasy"),
+        (popgym.Battleship(), "BattleshipMedium"),
+        (popgym.Concentration(deck_type="colors"), "ConcentrationEasy"),
+        (popgym.Concentration(), "ConcentrationHard"),
+        (popgym.LabyrinthEscape((14, 14)), "LabyrinthEscapeMedium"),
+        (popgym.CountRecall(error_clamp=2.0), "CountRecallEasy"),
+    ]:
+        assert env._spec.id == f"popgym-{id}-v0"
+    with pytest.raises(ValueError, match=r"one of its difficulties, num_decks=1, k=4; .*; got num_decks=1, k=2$"):
+        popgym.RepeatPrevious(k=2)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'decks'"):
+        popgym.RepeatPrevious(decks=2)
+    assert "RepeatPreviousEasy" in dir(popgym)
+    with pytest.raises(AttributeError, match="has no attribute 'RepeatNext'"):
+        popgym.RepeatNext  # noqa: B018
