@@ -155,6 +155,7 @@ fn difference(layout: &Layout, expected: &[Block], given: &[u8], only_numbers: b
                 | BatchSection::FinalVectorObservation
                 | BatchSection::FinalFeatures
                 | BatchSection::FinalGroundTruth
+                | BatchSection::FinalState
         );
         (0..layout.num_envs()).find_map(|env| {
             let start = section.offset() + env * row;
