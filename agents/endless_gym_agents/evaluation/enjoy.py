@@ -78,7 +78,7 @@ class EpisodeRecorder:
         generator = torch.Generator(self.agent.device).manual_seed(self.action_seed)
         for seed in seeds:
             # Like the original, an environment keeps some state between episodes; a new one gives the same video for a seed.
-            mode = "rgb_array" if spec(self.agent.settings.env).frame else "ansi"
+            mode = "rgb_array" if spec(self.agent.settings.env).shown else "ansi"
             with wrappers.make(self.agent.settings, 1, 1, autoreset="disabled", render_mode=mode) as envs:
                 yield from self._episode(envs, seed, generator)
 
@@ -101,7 +101,7 @@ class EpisodeRecorder:
             text += f"  reward {self.rewards[-1]:.2f}"
             frame = self._frame(envs.unwrapped, text + ("  end" if done else ""))
             yield frame
-        for _ in range(env_spec.render_fps if env_spec.frame else 0):
+        for _ in range(env_spec.render_fps if env_spec.shown else 0):
             yield frame
 
     @staticmethod
@@ -121,7 +121,7 @@ def execute(arguments: EnjoyArguments) -> None:
     agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)
     console = command.Terminal()
-    if spec(agent.settings.env).frame is None:
+    if spec(agent.settings.env).shown is None:
         for text in recorder.frames(arguments.seeds):
             print(text)
         return

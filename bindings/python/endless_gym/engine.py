@@ -17,7 +17,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer, named
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.create import connect
-from endless_gym.display.rendering import TEXT_MODES, VECTOR_MODES, View, checked_view
+from endless_gym.display.rendering import VECTOR_MODES, View, checked_view, modes_of
 from endless_gym.episodes import EpisodeOptions, validate_episode_options
 from endless_gym.program import program
 from endless_gym.program.engine_log import EngineLog, level
@@ -210,7 +210,7 @@ def serve(
         total_envs,
     )
     timeout = checked_timeout(timeout)
-    checked_view(render_mode, view, VECTOR_MODES if given.described.frame else TEXT_MODES)
+    checked_view(render_mode, view, modes_of(given.described, VECTOR_MODES))
     validate_episode_options(episode_options)
     if checkpoint is None and (checkpoint_every is not None or resume):
         raise ValueError("checkpoint must name a file if checkpoint_every or resume is given")

@@ -16,7 +16,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.display.descriptions import documented, metadata
 from endless_gym.display.keyboard import keys_to_action
-from endless_gym.display.rendering import SINGLE_MODES, TEXT_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.display.rendering import SINGLE_MODES, TEXT_MODES, SnapshotRenderer, View, checked_view, modes_of
 from endless_gym.display.window import Window, WindowClosed
 from endless_gym.specs import Frames, ObservationName, all_specs, contents, json_text, options_text, spec
 
@@ -116,7 +116,7 @@ class Env(gymnasium.Env[Any, Any]):
         independent_episodes: bool = False,
     ) -> None:
         self._spec = spec(id)
-        modes = SINGLE_MODES if self._spec.frame else TEXT_MODES
+        modes = modes_of(self._spec, SINGLE_MODES)
         self._view = checked_view(render_mode, view, modes)
         self._frames, self._features = contents(self._spec, observation, frames)
         self._independent_episodes = bool(independent_episodes)
@@ -332,7 +332,7 @@ class Env(gymnasium.Env[Any, Any]):
         if self._view == "ground_truth":
             # In the original, each picture in this mode advances the clue that is shown. The other modes show the current step's.
             return self._native.ground_truth_view(self.render_mode != "debug_rgb_array")
-        if self._frames == Frames():
+        if self._frames == Frames() or self._spec.frame is None:
             return self._native.rgb_array()
         if self._renderer is None:
             self._renderer = SnapshotRenderer(self._spec.id, "agent")

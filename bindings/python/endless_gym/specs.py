@@ -167,6 +167,8 @@ class Spec:
     actions: tuple[ActionBranch, ...]
     #: Width, height and channels of a frame; `None` if the environment has features only.
     frame: tuple[int, int, int] | None
+    #: Width, height and channels of the picture for people of an environment without frames; `None` if there is none.
+    picture: tuple[int, int, int] | None
     #: Length of the vector observation; 0 without one.
     vector_observation: int
     #: Length of `info["ground_truth"]`; 0 without one.
@@ -200,6 +202,11 @@ class Spec:
     render_fps: int
     #: Name of the native module that plays the environment.
     module: str = _native.__name__
+
+    @property
+    def shown(self) -> tuple[int, int, int] | None:
+        """Size of what people see: the frame, or the picture of an environment without frames."""
+        return self.frame or self.picture
 
     @property
     def native(self) -> ModuleType:
@@ -423,6 +430,7 @@ def described_spec(described: dict[str, Any], module: str = _native.__name__) ->
         described_actions=described["action_space"],
         actions=tuple(ActionBranch(branch["name"], _meanings(branch["choices"])) for branch in described["actions"]),
         frame=None if described["frame"] is None else tuple(described["frame"].values()),
+        picture=None if described["picture"] is None else tuple(described["picture"].values()),
         vector_observation=described["vector_observation"],
         ground_truth=len(described["ground_truth"]),
         ground_truth_columns=_meanings(described["ground_truth"]),

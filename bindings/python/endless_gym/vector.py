@@ -18,7 +18,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.display.descriptions import documented, metadata
-from endless_gym.display.rendering import TEXT_MODES, VECTOR_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.display.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view, modes_of
 from endless_gym.interop import PageLocks
 from endless_gym.requests.configuration import AutoresetMode, Options
 from endless_gym.requests.exceptions import TooManyBatchesHeld
@@ -96,7 +96,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         page-locks the engine's memory.
         """
         described = results.described
-        modes = VECTOR_MODES if described.frame else TEXT_MODES
+        modes = modes_of(described, VECTOR_MODES)
         shown = checked_view(render_mode, view, modes)
         self.render_mode = render_mode
         self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)

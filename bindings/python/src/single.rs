@@ -65,10 +65,13 @@ impl Single {
         Ok((self.arrays(py)?, batch.reward()[0], terminated, truncated, end))
     }
 
-    /// The last frame of the original's format, indexed \[row\]\[column\]\[channel\].
+    /// The last frame of the original's format, or the picture of an environment without frames, indexed \[row\]\[column\]\[channel\].
     fn rgb_array<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let spec = self.pool.spec();
-        let shape = spec.frame.ok_or_else(|| errors::pool(PoolError::NoFrame { id: spec.id }))?;
+        let shape = spec.shown().ok_or_else(|| errors::pool(PoolError::NoFrame { id: spec.id }))?;
+        if spec.frame.is_none() {
+            return arrays::picture(py, rgb_array(&self.pool.frame(0).map_err(errors::pool)?, shape));
+        }
         arrays::picture(py, rgb_array(Batch::new(self.pool.layout(), &self.blocks).observation(), shape))
     }
 

@@ -70,7 +70,7 @@ impl Game {
             .features(!registry.spec(id)?.features.is_empty());
         let pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let blocks = zeroed(pool.layout().blocks());
-        let rgba = pool.spec().frame.map_or(0, |frame| frame.width * frame.height * 4);
+        let rgba = pool.spec().shown().map_or(0, |frame| frame.width * frame.height * 4);
         let mut game = Game {
             expert: registry.expert(id).ok(),
             expert_is_in: true,
@@ -177,12 +177,11 @@ impl Game {
     }
 
     /// Draws both pictures. Call it once per step, since each call advances the clue's picture in the ground-truth
-    /// view. Without frames, there are none.
+    /// view.
     fn draw(&mut self) -> Result<(), WebError> {
-        let Some(shape) = self.pool.spec().frame else { return Ok(()) };
+        let Some(shape) = self.pool.spec().shown() else { return Ok(()) };
         put_view(&self.pool.ground_truth_view(0)?, shape, &mut self.view);
-        let batch = Batch::new(self.pool.layout(), &self.blocks);
-        put_observation(batch.observation(), shape, &mut self.observation, shape.width);
+        put_observation(&self.pool.frame(0)?, shape, &mut self.observation, shape.width);
         Ok(())
     }
 
@@ -228,8 +227,8 @@ impl Game {
             "clues": self.clues.shown(),
             "action": self.action,
             "vector": batch.vector_observation(),
-            // Shown if there are no frames.
-            "features": self.pool.spec().frame.is_none().then(|| batch.features()),
+            // Shown if there is no picture.
+            "features": self.pool.spec().shown().is_none().then(|| batch.features()),
             "recording": recording,
         }))
     }

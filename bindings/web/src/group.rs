@@ -23,6 +23,8 @@ pub struct Group {
     shape: FrameShape,
     pool: Pool,
     blocks: Vec<Block>,
+    /// Pictures of environments without frames, one after the other.
+    drawn: Vec<u8>,
     policy: Policy,
     actions: Vec<i32>,
     episodes: u64,
@@ -41,7 +43,7 @@ impl Group {
         seed: u64,
     ) -> Result<Self, WebError> {
         let spec = registry.spec(id)?;
-        let shape = spec.frame.ok_or(WebError::NoFrame { id: spec.id })?;
+        let shape = spec.shown().ok_or(WebError::NoFrame { id: spec.id })?;
         // Each episode has its own seed, so that it can be played alone.
         let seeding = Seeding::Range { start: 0, end: SEEDS, step: 1, seed: Some(seed) };
         let options = ResetOptions::Shared(options);
@@ -54,7 +56,10 @@ impl Group {
             false => Policy::Random(Generator::from_seed(seed)),
         };
         let actions = vec![0; num_envs * spec.action_space.width()];
-        Ok(Group { shape, pool, blocks, policy, actions, episodes: 0, returns: 0.0, lengths: 0.0 })
+        let mut group =
+            Group { shape, pool, blocks, drawn: Vec::new(), policy, actions, episodes: 0, returns: 0.0, lengths: 0.0 };
+        group.draw()?;
+        Ok(group)
     }
 
     /// Steps every environment. The step after an episode's end starts the next one.
@@ -70,6 +75,7 @@ impl Group {
             Policy::Experts(experts) => experts.act(&batch, &mut self.actions)?,
         }
         self.pool.step(&self.actions, &mut self.blocks)?;
+        self.draw()?;
         let batch = Batch::new(self.pool.layout(), &self.blocks);
         for env in (0..batch.layout().num_envs()).filter(|env| batch.has_ended(*env)) {
             self.episodes += 1;
@@ -79,9 +85,21 @@ impl Group {
         Ok(())
     }
 
-    /// The observations, one after the other, and their shape.
+    /// Draws the pictures of environments without frames.
+    fn draw(&mut self) -> Result<(), WebError> {
+        self.drawn.clear();
+        if self.pool.spec().frame.is_none() {
+            for env in 0..self.pool.layout().num_envs() {
+                self.drawn.extend(self.pool.frame(env)?);
+            }
+        }
+        Ok(())
+    }
+
+    /// The observations or pictures, one after the other, and their shape.
     pub fn observations(&self) -> impl Iterator<Item = (&[u8], FrameShape)> {
-        let observations = Batch::new(self.pool.layout(), &self.blocks).observation();
+        let frames = Batch::new(self.pool.layout(), &self.blocks).observation();
+        let observations = if frames.is_empty() { &self.drawn } else { frames };
         observations.chunks_exact(self.shape.bytes()).map(|observation| (observation, self.shape))
     }
 

@@ -153,7 +153,7 @@ export class Play {
       this.#legend();
       this.#pad();
       this.controls.show(this.spec);
-      this.#frame(this.spec.frame);
+      this.#frame(this.spec.frame ?? this.spec.picture);
       this.#originalPace();
     }
     this.changed(state);
@@ -239,9 +239,10 @@ export class Play {
   #show() {
     const { state, spec } = this;
     if (!state) return;
-    if (spec.frame) {
-      $("observation").getContext("2d").putImageData(this.engine.observation(spec.frame), 0, 0);
-      $("view").getContext("2d").putImageData(this.engine.view(spec.frame), 0, 0);
+    const shape = spec.frame ?? spec.picture;
+    if (shape) {
+      $("observation").getContext("2d").putImageData(this.engine.observation(shape), 0, 0);
+      $("view").getContext("2d").putImageData(this.engine.view(shape), 0, 0);
     } else {
       showNumbers($("features"), spec.features.map(({ name }, index) => ({ name, value: state.features[index] })));
     }

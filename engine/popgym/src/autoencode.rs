@@ -4,10 +4,12 @@ use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
 use crate::ids::{INTEGER_ZERO, SUITS, ids, place, shape};
+use crate::pictures::{self, ALONE, PICTURE};
 
 const IDS: [&str; 3] = ids!("Autoencode");
 const DECKS: [usize; 3] = [1, 2, 3];
@@ -45,6 +47,7 @@ impl Task for Autoencode {
                 ObservationSpace::Discrete(4),
             ])),
             types: INTEGER_ZERO,
+            picture: Some(PICTURE),
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
         }
     }
@@ -104,6 +107,19 @@ impl Task for Autoencode {
         rest[0] = if self.deck.left() > 0 { 1.0 } else { 0.0 };
         let held = parameters.decks * DECK - self.deck.left() - self.named;
         rest[1] = (held as f64 / cards.len() as f64) as f32;
+    }
+
+    /// The band below the card says whether the agent watches (blue) or names suits (gold). A question mark covers the 0 of the latter.
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        pictures::table(canvas);
+        let watches = self.deck.left() > 0;
+        if watches || self.card > 0 {
+            pictures::card(canvas, ALONE, Face::Suit, self.card);
+        } else {
+            pictures::back(canvas, ALONE, true);
+        }
+        let band = if watches { pictures::BLUE } else { pictures::GOLD };
+        canvas.draw_rect(band, Rect::new(20, 77, 44, 4), 0);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

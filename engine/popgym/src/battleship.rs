@@ -6,9 +6,11 @@ use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ids, place, shape};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [&str; 3] = ids!("Battleship");
 const SIZES: [usize; 3] = [8, 10, 12];
@@ -95,6 +97,7 @@ impl Task for Battleship {
                 markov_state: state.leak(),
                 needs_previous_action: true,
                 observation_space: Some(ObservationSpace::Discrete(2)),
+                picture: Some(PICTURE),
                 ..EnvSpec::new(id, summary, actions)
             }
         };
@@ -137,6 +140,17 @@ impl Task for Battleship {
         let squares = rows.flat_map(|row| (0..parameters.size).map(move |column| row >> column & 1));
         let last = squares.chain([self.is_hit.into()]);
         out.iter_mut().zip(last).for_each(|(out, bit)| *out = bit.into());
+    }
+
+    /// Fire after a hit, rings in the water otherwise.
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        canvas.fill(pictures::BLUE);
+        if self.is_hit {
+            canvas.draw_circle(pictures::RED, (42, 42), 28, 0);
+            canvas.draw_circle(pictures::GOLD, (42, 42), 16, 0);
+        } else {
+            [12, 22, 32].iter().for_each(|radius| canvas.draw_circle(pictures::PAPER, (42, 42), *radius, 2));
+        }
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -7,10 +7,12 @@ use endless_gym_core::envs::{
     StatePart, StateSpace, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::filter::Filter;
 use crate::ids::{ids, place};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [[&str; 3]; 3] =
     [ids!("PositionOnlyCartPole"), ids!("VelocityOnlyCartpole"), ids!("NoisyPositionOnlyCartPole")];
@@ -148,6 +150,7 @@ impl Task for CartPole {
                 markov_state: STATE,
                 parameters: PARAMETERS,
                 render_fps: 50,
+                picture: Some(PICTURE),
                 ..EnvSpec::new(id, summary, ActionSpace::Discrete(2))
             })
         });
@@ -194,6 +197,22 @@ impl Task for CartPole {
 
     fn markov_state(&self, _: &Parameters, out: &mut [f32]) {
         out.copy_from_slice(&[self.x, self.velocity, self.angle, self.angular_velocity].map(|number| number as f32));
+    }
+
+    /// Cart and pole where positions are observed, and bars of the two velocities otherwise.
+    fn paint(&self, parameters: &Parameters, canvas: &mut Canvas<'_>) {
+        canvas.fill(pictures::DARK);
+        let [first, second] = self.observation.map(f64::from);
+        if parameters.velocities {
+            pictures::gauge(canvas, 24, first / 3.0, pictures::BLUE);
+            pictures::gauge(canvas, 50, second / 3.0, pictures::GOLD);
+            return;
+        }
+        let x = 42 + (first / MAX_X * 34.0).clamp(-60.0, 60.0).round() as i32;
+        canvas.draw_line(pictures::GREY, (0, 66), (83, 66), 1);
+        canvas.draw_rect(pictures::BLUE, Rect::new(x - 8, 56, 17, 10), 0);
+        let end = (x + (40.0 * second.sin()).round() as i32, 56 - (40.0 * second.cos()).round() as i32);
+        canvas.draw_line(pictures::GOLD, (x, 56), end, 4);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -4,10 +4,12 @@ use endless_gym_core::envs::{
     ActionSpace, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, StateSpace, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
 use crate::ids::{INTEGER_ZERO, ids, numbered, place, shape};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [&str; 3] = ids!("Concentration");
 const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Colour), (1, Face::Rank)];
@@ -103,6 +105,7 @@ impl Task for Concentration {
                 needs_previous_action: true,
                 types: INTEGER_ZERO,
                 observation_space: Some(ObservationSpace::MultiDiscrete(faces)),
+                picture: Some(PICTURE),
                 ..EnvSpec::new(id, summary, ActionSpace::Discrete(cards as i32))
             }
         };
@@ -177,6 +180,19 @@ impl Task for Concentration {
             _ => [first, none],
         };
         turned.copy_from_slice(&shown.map(f32::from));
+    }
+
+    fn paint(&self, parameters: &Parameters, canvas: &mut Canvas<'_>) {
+        pictures::table(canvas);
+        let columns = if parameters.decks == 1 { 8 } else { 12 };
+        let (width, height) = (84 / columns, if parameters.decks == 1 { 12 } else { 9 });
+        for (number, shown) in (0..).zip(&self.view) {
+            let place = Rect::new(number % columns * width + 1, number / columns * height + 1, width - 1, height - 1);
+            match usize::from(*shown) < parameters.face.count() {
+                true => pictures::card(canvas, place, parameters.face, *shown),
+                false => pictures::back(canvas, place, false),
+            }
+        }
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -4,10 +4,12 @@ use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
 use crate::ids::{ids, numbered, place, shape};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [&str; 3] = ids!("CountRecall");
 const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Suit), (4, Face::Rank)];
@@ -87,6 +89,7 @@ impl Task for CountRecall {
                 observation_space: Some(ObservationSpace::MultiDiscrete(kinds)),
                 ground_truth,
                 ground_truth_is_integer: true,
+                picture: Some(PICTURE),
                 ..EnvSpec::new(id, summary, actions)
             }
         };
@@ -115,6 +118,15 @@ impl Task for CountRecall {
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = self.card.into();
         out[1] = self.query.into();
+    }
+
+    /// The card on the left, and on gold the kind whose count is asked.
+    fn paint(&self, parameters: &Parameters, canvas: &mut Canvas<'_>) {
+        pictures::table(canvas);
+        pictures::card(canvas, Rect::new(4, 18, 34, 48), parameters.face, self.card);
+        canvas.draw_rect(pictures::GOLD, Rect::new(43, 4, 41, 76), 0);
+        pictures::question(canvas, Rect::new(46, 6, 34, 14));
+        pictures::card(canvas, Rect::new(46, 24, 34, 48), parameters.face, self.query);
     }
 
     fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {

@@ -5,10 +5,12 @@ use endless_gym_core::envs::{
     Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
 use crate::ids::{INTEGER_ZERO, ids, place};
+use crate::pictures::{self, ALONE, PICTURE};
 
 const IDS: [&str; 3] = ids!("HigherLower");
 const DECKS: [usize; 3] = [1, 2, 3];
@@ -60,6 +62,7 @@ impl Task for HigherLower {
             ground_truth_is_integer: true,
             markov_state: STATE,
             types: INTEGER_ZERO,
+            picture: Some(PICTURE),
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(2))
         }
     }
@@ -94,6 +97,11 @@ impl Task for HigherLower {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = self.rank().into();
+    }
+
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        pictures::table(canvas);
+        pictures::card(canvas, ALONE, Face::Rank, self.rank());
     }
 
     fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {

@@ -7,10 +7,12 @@ use endless_gym_core::envs::{
     RewardType, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ids, numbered, place, shape};
 use crate::maze::{Maze, Place, connected};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [[&str; 3]; 2] = [ids!("LabyrinthEscape"), ids!("LabyrinthExplore")];
 /// Cells from the left to the right, between walls.
@@ -148,6 +150,7 @@ impl Task for Labyrinth {
                 observation_space: Some(SPACE),
                 ground_truth: GROUND_TRUTH,
                 ground_truth_is_integer: true,
+                picture: Some(PICTURE),
                 ..EnvSpec::new(id, summary, ActionSpace::Discrete(4))
             })
         });
@@ -203,6 +206,26 @@ impl Task for Labyrinth {
             *out = if is_inside { self.square(place, parameters.escapes) } else { WALL };
         }
         out[VIEW] = self.action.into();
+    }
+
+    fn paint(&self, parameters: &Parameters, canvas: &mut Canvas<'_>) {
+        let mut features = [0.0; VIEW + 1];
+        self.features(parameters, &mut features);
+        for (number, square) in (0..).zip(&features[..VIEW]) {
+            let color = match *square {
+                WALL => pictures::DARK,
+                START => pictures::BLUE,
+                GOAL => pictures::GREEN,
+                _ => pictures::PAPER,
+            };
+            canvas.draw_rect(color, Rect::new(number % 3 * 28, number / 3 * 28, 27, 27), 0);
+        }
+        // An arrow of the last action.
+        let ends = [(6, 42), (78, 42), (42, 6), (42, 78)];
+        if let Some(end) = ends.get(usize::from(self.action)) {
+            canvas.draw_line(pictures::RED, (42, 42), *end, 3);
+            canvas.draw_circle(pictures::RED, *end, 4, 0);
+        }
     }
 
     fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {

@@ -19,6 +19,7 @@ mod maze;
 pub mod mine_sweeper;
 pub mod multiarmed_bandit;
 pub mod pendulum;
+mod pictures;
 pub mod repeat_first;
 pub mod repeat_previous;
 

@@ -4,9 +4,11 @@ use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ids, place, shape};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [&str; 3] = ids!("MineSweeper");
 /// The board's size, and the number of mines.
@@ -75,6 +77,7 @@ impl Task for MineSweeper {
                 markov_state: state.leak(),
                 needs_previous_action: true,
                 observation_space: Some(ObservationSpace::Discrete(mines.min(9) as i32 + 1)),
+                picture: Some(PICTURE),
                 ..EnvSpec::new(id, summary, actions)
             }
         };
@@ -121,6 +124,13 @@ impl Task for MineSweeper {
         for (square, out) in out.iter_mut().enumerate() {
             *out = if self.mines >> square & 1 == 1 { 1.0 } else { 2.0 * f32::from(self.viewed >> square & 1 == 1) };
         }
+    }
+
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        canvas.fill(pictures::GREY);
+        canvas.draw_rect(pictures::PAPER, Rect::new(14, 14, 56, 56), 0);
+        let color = [pictures::GREEN, pictures::BLUE, pictures::RED][usize::from(self.count.min(2))];
+        pictures::digit(canvas, Rect::new(18, 18, 48, 48), self.count, color);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

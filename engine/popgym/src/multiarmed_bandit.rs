@@ -4,9 +4,11 @@ use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ids, numbered, place, shape};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [&str; 3] = ids!("MultiarmedBandit");
 /// Arms, and the length of an episode.
@@ -46,6 +48,7 @@ impl Task for MultiarmedBandit {
             needs_previous_action: true,
             observation_space: Some(ObservationSpace::Discrete(2)),
             ground_truth: numbered("bandits", arms, "probability that the arm pays"),
+            picture: Some(PICTURE),
             ..EnvSpec::new(id, "Find the arms that pay best", ActionSpace::Discrete(arms as i32))
         };
         IDS.into_iter().zip(VARIANTS).map(spec).collect()
@@ -71,6 +74,16 @@ impl Task for MultiarmedBandit {
 
     fn features(&self, _: &Parameters, out: &mut [f32]) {
         out[0] = f32::from(u8::from(self.has_paid));
+    }
+
+    /// A coin if the last arm paid.
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        canvas.fill(pictures::DARK);
+        canvas.draw_circle(pictures::GREY, (42, 42), 30, 2);
+        if self.has_paid {
+            canvas.draw_circle(pictures::GOLD, (42, 42), 28, 0);
+            canvas.draw_circle(pictures::PAPER, (42, 42), 20, 2);
+        }
     }
 
     fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {

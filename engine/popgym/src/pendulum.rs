@@ -8,10 +8,12 @@ use endless_gym_core::envs::{
     StatePart, StateSpace, Task, Transition, box_action,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::filter::Filter;
 use crate::ids::{ids, place};
+use crate::pictures::{self, PICTURE};
 
 const IDS: [[&str; 3]; 2] = [ids!("PositionOnlyPendulum"), ids!("NoisyPositionOnlyPendulum")];
 const LENGTHS: [u32; 3] = [200, 150, 100];
@@ -105,6 +107,7 @@ impl Task for Pendulum {
                 observation_space: Some(ObservationSpace::Box { low: &[-1.0; 2], high: &[1.0; 2] }),
                 parameters: PARAMETERS,
                 render_fps: 30,
+                picture: Some(PICTURE),
                 ..EnvSpec::new(id, summary, ActionSpace::bounded(&[-MAX_TORQUE], &[MAX_TORQUE]))
             })
         });
@@ -147,6 +150,16 @@ impl Task for Pendulum {
 
     fn markov_state(&self, _: &Parameters, out: &mut [f32]) {
         out.copy_from_slice(&[self.angle.cos(), self.angle.sin(), self.velocity].map(|number| number as f32));
+    }
+
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        canvas.fill(pictures::DARK);
+        let [cos, sin] = self.observation.map(f64::from);
+        // The angle grows anticlockwise.
+        let end = (42 - (32.0 * sin).round() as i32, 42 - (32.0 * cos).round() as i32);
+        canvas.draw_line(pictures::GOLD, (42, 42), end, 6);
+        canvas.draw_circle(pictures::PAPER, (42, 42), 4, 0);
+        canvas.draw_circle(pictures::RED, end, 6, 0);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

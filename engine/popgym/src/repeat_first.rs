@@ -4,10 +4,12 @@ use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
 use crate::ids::{SUITS, ids, place};
+use crate::pictures::{self, ALONE, PICTURE};
 
 const IDS: [&str; 3] = ids!("RepeatFirst");
 const DECKS: [usize; 3] = [1, 8, 16];
@@ -41,6 +43,7 @@ impl Task for RepeatFirst {
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(4)),
             markov_state: STATE,
+            picture: Some(PICTURE),
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
         }
     }
@@ -75,6 +78,11 @@ impl Task for RepeatFirst {
         out[0] = self.first.into();
         let each = (parameters.decks * DECK) as f64 / 4.0;
         self.deck.write_dealt(&mut out[1..], |count| 1.0 - count / each);
+    }
+
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        pictures::table(canvas);
+        pictures::card(canvas, ALONE, Face::Suit, self.card);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

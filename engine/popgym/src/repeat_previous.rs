@@ -6,10 +6,12 @@ use endless_gym_core::envs::{
     ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, Deck, Face};
 use crate::ids::{INTEGER_ZERO, SUITS, ids, place, shape};
+use crate::pictures::{self, ALONE, PICTURE};
 
 const IDS: [&str; 3] = ids!("RepeatPrevious");
 /// Number of decks, and which card to name: 1 is the card that is shown.
@@ -40,6 +42,7 @@ impl Task for RepeatPrevious {
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(4)),
             types: INTEGER_ZERO,
+            picture: Some(PICTURE),
             ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
         }
     }
@@ -88,6 +91,11 @@ impl Task for RepeatPrevious {
         }
         let each = (parameters.decks * DECK) as f64 / 4.0;
         self.deck.write_dealt(left, |count| 1.0 - count / each);
+    }
+
+    fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {
+        pictures::table(canvas);
+        pictures::card(canvas, ALONE, Face::Suit, self.card);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

@@ -227,7 +227,7 @@ impl Observation {
                     "id": self.specification.id,
                     "groups": self.specification.groups,
                     "num_envs": self.specification.num_envs,
-                    "has_frames": !self.specification.environment["frame"].is_null(),
+                    "has_frames": (["frame", "picture"].iter().any(|name| self.specification.environment[name].is_object())),
                     "status": self.status,
                 });
                 let lease = self.groups.get(selection.group).and_then(WatchedGroup::newest);

@@ -45,7 +45,7 @@ pub(crate) fn reset(pool: &mut Pool) -> Vec<Block> {
 
 /// Draws the ground-truth view, if there is one.
 pub(crate) fn view(pool: &mut Pool) {
-    if pool.spec().frame.is_some() {
+    if pool.spec().shown().is_some() {
         pool.ground_truth_view(0).expect("the environment exists");
     }
 }

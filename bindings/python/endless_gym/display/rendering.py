@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.specs import json_text, spec
+from endless_gym.specs import Spec, json_text, spec
 
-#: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3); or the
-#: text of what the agent sees, in environments without frames.
+#: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3), which shows
+#: the same in environments without frames; or the text of what the agent sees, in environments without frames.
 View = Literal["agent", "ground_truth", "text"]
 
 #: The render modes of a single environment, with the views that each can show; the first is the original's.
@@ -25,8 +25,14 @@ SINGLE_MODES: dict[str, tuple[View, ...]] = {
 #: The render modes of a vector environment.
 VECTOR_MODES = {mode: views for mode, views in SINGLE_MODES.items() if mode != "human"}
 
-#: The render modes of environments without frames.
+#: The further render modes of environments without frames.
 TEXT_MODES: dict[str, tuple[View, ...]] = {"ansi": ("text",)}
+
+
+def modes_of(described: Spec, modes: dict[str, tuple[View, ...]]) -> dict[str, tuple[View, ...]]:
+    """Those of the modes that an environment has, and the text modes if it has no frames."""
+    drawn = modes if described.shown else {}
+    return drawn if described.frame else drawn | TEXT_MODES
 
 
 def checked_view(render_mode: Any, view: Any, modes: dict[str, tuple[View, ...]]) -> View | None:
@@ -40,7 +46,7 @@ def checked_view(render_mode: Any, view: Any, modes: dict[str, tuple[View, ...]]
             raise ValueError(f"view must be None without a render_mode, got {view!r}")
         return None
     if not isinstance(render_mode, str) or render_mode not in modes:
-        where = " in environments without frames" if modes is TEXT_MODES else ""
+        where = " in environments without pictures" if modes == TEXT_MODES else ""
         raise ValueError(f"render_mode must be None or one of {', '.join(modes)}{where}, got {render_mode!r}")
     views = modes[render_mode]
     if view is None:

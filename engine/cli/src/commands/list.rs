@@ -29,7 +29,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
             let spec = registry.spec(id)?;
             match () {
                 _ if args.json => print_json(&as_json(spec)),
-                _ if args.picture.applies() && spec.frame.is_some() => {
+                _ if args.picture.applies() && spec.shown().is_some() => {
                     print_coloured(format_args!("{}\n{}", picture(registry, spec, output::width())?, description(spec)))
                 }
                 _ => print(description(spec)),

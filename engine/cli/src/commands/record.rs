@@ -97,7 +97,7 @@ impl FilmArgs {
 fn film(registry: &Registry, args: &FilmArgs) -> Result<(), Failure> {
     let spec = registry.spec(&args.id)?;
     let fps = args.fps.unwrap_or(u16::try_from(spec.render_fps)?);
-    let size = args.view.size(spec.frame.ok_or(PoolError::NoFrame { id: spec.id })?);
+    let size = args.view.size(spec.shown().ok_or(PoolError::NoFrame { id: spec.id })?);
     let shape = Shape { size, scale: usize::from(args.scale), fps };
     let stop = stop::on_signal()?;
     // Create the environment first, so that invalid options are reported before a file exists.

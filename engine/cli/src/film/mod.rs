@@ -59,8 +59,8 @@ impl Film {
     /// The observation.
     pub fn observation(&self) -> Result<Picture, Failure> {
         let spec = self.pool.spec();
-        let shape = spec.frame.ok_or(PoolError::NoFrame { id: spec.id })?;
-        Ok(rgb_array(self.batch().observation(), shape))
+        let shape = spec.shown().ok_or(PoolError::NoFrame { id: spec.id })?;
+        Ok(rgb_array(&self.pool.frame(0)?, shape))
     }
 
     /// The ground-truth view. Each call may show the next picture of an animation; call it once per step.

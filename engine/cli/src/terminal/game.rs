@@ -60,12 +60,13 @@ impl Game {
         Ok(())
     }
 
-    /// What the agent sees; black without frames.
+    /// What the agent sees; black without a picture.
     pub fn frame(&self) -> Pixels {
-        newest(self.batch().observation(), Frames::default(), self.spec().frame.unwrap_or(FrameShape::rgb(1, 1)))
+        let drawn = self.pool.frame(0).unwrap_or_else(|_| vec![0; 3]);
+        newest(&drawn, Frames::default(), self.spec().shown().unwrap_or(FrameShape::rgb(1, 1)))
     }
 
-    /// What the agent sees of an environment without frames.
+    /// What the agent sees of an environment without a picture.
     pub fn features(&self) -> String {
         self.spec().text(self.batch().features())
     }

@@ -205,13 +205,13 @@ impl Player {
     }
 }
 
-/// Draws the picture in the middle, or features where there are no frames, and the lines below it.
+/// Draws the picture in the middle, or features where there is none, and the lines below it.
 fn draw(frame: &mut Frame<'_>, game: &Game, lines: &[String]) {
     let area = frame.area();
     let lines = status::wrapped(lines, area.width);
     let (above, below) = status::divide(area, lines.len() as u16);
     status::draw(frame, below, &lines);
-    if game.spec().frame.is_none() {
+    if game.spec().shown().is_none() {
         return status::draw(frame, above, &status::wrapped(&[String::new(), game.features()], area.width));
     }
     let picture = game.frame();

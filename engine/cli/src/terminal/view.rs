@@ -54,7 +54,7 @@ pub struct TerminalArgs {
 
 /// The environments that are shown, by group and number.
 struct Wall {
-    /// `None` if the environments have no frames.
+    /// `None` if the environments have no pictures.
     frames: Option<(Frames, FrameShape)>,
     /// By group, what the engine draws if its batches have no frames.
     pictures: BTreeMap<usize, Pictures>,
@@ -263,7 +263,7 @@ fn draw(frame: &mut Frame<'_>, wall: &mut Wall, [first, last]: [String; 2]) {
     let total = wall.num_envs * wall.groups;
     let lines = |wall: &Wall, shown: usize| {
         let middle = match wall.frames {
-            None => "these environments have no frames".to_owned(),
+            None => "these environments have no pictures".to_owned(),
             Some(_) if wall.seen.is_empty() => "no trainer has stepped the engine since".to_owned(),
             Some(_) => format!("{shown} of {total} environments are shown"),
         };

@@ -279,6 +279,8 @@ pub struct EnvSpec {
     pub action_space: ActionSpace,
     /// Size of the frame; `None` if the environment has features only, which every batch then contains.
     pub frame: Option<FrameShape>,
+    /// Size of the picture for people of an environment without frames; `None` if there is none.
+    pub picture: Option<FrameShape>,
     /// The meaning of an action's numbers, in the order of its branches.
     pub actions: &'static [ActionBranch],
     /// Length of the vector observation (float32 in 0..=1); 0 if there is none.
@@ -329,6 +331,7 @@ impl EnvSpec {
             summary,
             action_space,
             frame: None,
+            picture: None,
             actions: &[],
             vector_observation: 0,
             ground_truth: &[],
@@ -347,6 +350,11 @@ impl EnvSpec {
             step_limit: |parameters| Some(parameters.int("max_steps", 0)).filter(|steps| *steps > 0),
             render_fps: 25,
         }
+    }
+
+    /// Size of what people see: the frame, or the picture of an environment without frames.
+    pub fn shown(&self) -> Option<FrameShape> {
+        self.frame.or(self.picture)
     }
 
     /// Features as text, such as `suit hearts  mines 2`. A feature that is named as a branch of the actions has the names of its choices.

@@ -106,7 +106,7 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
     /// Writes the feature observation, float32 in the order of [`EnvSpec::features`].
     fn features(&self, _parameters: &Self::Parameters, _out: &mut [f32]) {}
 
-    /// Draws the frame on a black canvas.
+    /// Draws the frame, or the picture of an environment without frames, on a black canvas.
     fn paint(&self, _parameters: &Self::Parameters, _canvas: &mut Canvas<'_>) {}
 
     /// Writes the pixels of a frame with 1 or 4 channels, instead of [`paint`](Task::paint). The byte of channel `c` of the pixel `(x, y)`

@@ -33,6 +33,11 @@ impl FrameFormat {
         FrameFormat { shape, format: frames.unwrap_or_default().format }
     }
 
+    /// The pictures for people, in the default format.
+    pub fn shown(spec: &EnvSpec) -> Option<Self> {
+        Some(FrameFormat { shape: spec.shown()?, format: PixelFormat::default() })
+    }
+
     /// Bytes of a frame.
     pub fn bytes(self) -> usize {
         self.format.shape(self.shape).iter().product()

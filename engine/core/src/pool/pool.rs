@@ -381,8 +381,8 @@ impl Pool {
         Ok(catch(|| self.envs.progress(env)).map_err(|message| self.panic(Some(env), message))?)
     }
 
-    /// The frame that one environment's observation shows, in the default format, whether or not batches contain frames. Draws it
-    /// in full and changes nothing.
+    /// The frame that one environment's observation shows, in the default format, whether or not batches contain frames, or the
+    /// [picture](EnvSpec::picture) of an environment without frames. Draws it in full and changes nothing.
     ///
     /// # Errors
     ///
@@ -400,8 +400,7 @@ impl Pool {
     /// ```
     pub fn frame(&self, env: usize) -> Result<Vec<u8>, PoolError> {
         self.check_running(env)?;
-        self.spec().frame.ok_or(PoolError::NoFrame { id: self.spec().id })?;
-        let format = FrameFormat::new(self.spec(), None);
+        let format = FrameFormat::shown(self.spec()).ok_or(PoolError::NoFrame { id: self.spec().id })?;
         Ok(catch(|| self.envs.frame(env, format)).map_err(|message| self.panic(Some(env), message))?)
     }
 
@@ -412,7 +411,7 @@ impl Pool {
     /// [`PoolError::NotReset`], [`PoolError::NoSuchEnv`] or [`PoolError::NoFrame`].
     pub fn ground_truth_view(&mut self, env: usize) -> Result<Picture, PoolError> {
         self.check_running(env)?;
-        let shape = self.spec().frame.ok_or(PoolError::NoFrame { id: self.spec().id })?;
+        let shape = self.spec().shown().ok_or(PoolError::NoFrame { id: self.spec().id })?;
         Ok(catch(|| self.envs.ground_truth_view(env, shape)).map_err(|message| self.panic(Some(env), message))?)
     }
 

@@ -40,7 +40,7 @@ impl Registry {
         if self.specs().any(|known| known.id == id) {
             return Err(RegistryError::Duplicate { id });
         }
-        if let Some(given) = spec.frame.filter(|frame| !frame.is_valid()) {
+        if let Some(given) = spec.shown().filter(|frame| !frame.is_valid()) {
             return Err(RegistryError::Frame { id, given });
         }
         if spec.frame.is_none() && spec.features.is_empty() {

@@ -67,7 +67,8 @@ impl Pictures {
     /// created in `/dev/shm`.
     pub fn of(observer: &Observer) -> Result<Option<Self>, ServiceError> {
         let (specification, node) = (observer.specification(), observer.node());
-        let shape = FrameShape::deserialize(&specification.environment["frame"]).ok();
+        let shape = |name| FrameShape::deserialize(&specification.environment[name]).ok();
+        let shape = shape("frame").or(shape("picture"));
         let Some(shape) = shape.filter(|_| specification.frames.is_none()) else { return Ok(None) };
         // Under the creation lock, since another process would remove the file while it is empty.
         let _creating = node.creating()?;
