@@ -87,6 +87,7 @@ impl Game {
             view: vec![0; rgba],
         };
         game.reset(seed)?;
+        game.draw()?;
         Ok(game)
     }
 
@@ -102,7 +103,7 @@ impl Game {
         self.agent_memory = None;
         self.clues.reset();
         self.action.fill(0);
-        self.observe()
+        self.remember()
     }
 
     fn batch(&self) -> Batch<'_> {
@@ -111,6 +112,22 @@ impl Game {
 
     /// Plays one step. After the last step of a trace's episode, a trace step starts the next episode.
     pub fn step(&mut self, player: Player) -> Result<(), WebError> {
+        self.advance(player)?;
+        self.draw()
+    }
+
+    /// Lets the agent play so many steps or to the episode's end, and draws only the last one.
+    pub fn play_out(&mut self, agent: &Rc<Agent>, most: usize) -> Result<(), WebError> {
+        for _ in 0..most {
+            if self.batch().has_ended(0) {
+                break;
+            }
+            self.advance(Player::Agent(Rc::clone(agent)))?;
+        }
+        self.draw()
+    }
+
+    fn advance(&mut self, player: Player) -> Result<(), WebError> {
         match player {
             Player::Person(action) => {
                 (self.expert_is_in, self.agent_memory) = (false, None);
@@ -142,7 +159,7 @@ impl Game {
         }
         self.pool.step(&self.action, &mut self.blocks)?;
         self.recorder.step(&self.action, &self.pool, &self.blocks);
-        self.observe()
+        self.remember()
     }
 
     /// Lets the agent choose the action.
@@ -160,10 +177,25 @@ impl Game {
         Ok(())
     }
 
-    /// Updates clues and pictures after a reset or step.
-    fn observe(&mut self) -> Result<(), WebError> {
-        self.clues.observe(Batch::new(self.pool.layout(), &self.blocks).features());
-        self.draw()
+    /// Updates the clues after a reset or step.
+    fn remember(&mut self) -> Result<(), WebError> {
+        let collected =
+            self.pool.progress(0)?.iter().find(|progress| progress.name == "coins").map_or(0.0, |coins| coins.value);
+        let spec = self.pool.spec();
+        let right =
+            spec.actions.first().and_then(|branch| branch.choices.iter().position(|choice| choice.name == "right"));
+        let is_right = self.length() > 0 && right == self.action.first().map(|number| *number as usize);
+        let speed = match self.options.get("agent_speed").and_then(Json::as_f64) {
+            Some(given) => given,
+            None => spec
+                .parameters
+                .iter()
+                .find(|parameter| parameter.name == "agent_speed")
+                .map_or(0.0, |parameter| parameter.default_text().parse().unwrap_or(0.0)),
+        };
+        let moved = if is_right { speed / spec.frame.map_or(1.0, |frame| frame.width as f64) } else { 0.0 };
+        self.clues.observe(Batch::new(self.pool.layout(), &self.blocks).features(), collected, moved as f32);
+        Ok(())
     }
 
     /// The environment id.
@@ -224,7 +256,7 @@ impl Game {
             "done": done,
             "info": done.then_some(info),
             "progress": self.pool.progress(0)?,
-            "clues": self.clues.shown(),
+            "clues": self.clues.seen(),
             "action": self.action,
             "vector": batch.vector_observation(),
             // Shown if there is no picture.

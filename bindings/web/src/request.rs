@@ -52,6 +52,10 @@ pub enum Request {
     StepOfExpert,
     StepOfAgent,
     StepOfTrace,
+    /// Lets the loaded agent play so many steps or to the episode's end, of which only the last one is drawn.
+    StepsOfAgent {
+        most: usize,
+    },
     /// The recording of the game, as bytes.
     Save,
     /// Starts a wall.
@@ -83,9 +87,12 @@ pub enum Reply {
 impl Request {
     pub fn carry_out(self, app: &mut App) -> Result<Reply, WebError> {
         let player = match self {
-            Request::StepOfAgent => {
-                let id = app.game.as_ref().ok_or(WebError::NoGame)?.id();
-                Player::Agent(Rc::clone(app.agents.get(id).ok_or(WebError::NoAgent { id })?))
+            Request::StepOfAgent => Player::Agent(agent(app)?),
+            Request::StepsOfAgent { most } => {
+                let agent = agent(app)?;
+                let game = app.game.as_mut().ok_or(WebError::NoGame)?;
+                game.play_out(&agent, most)?;
+                return Ok(Reply::Json(game.state()?));
             }
             Request::Specs => {
                 return Ok(Reply::Json(app.registry.specs().map(|entry| spec(&app.registry, entry)).collect()));
@@ -121,6 +128,12 @@ impl Request {
         game.step(player)?;
         Ok(Reply::Json(game.state()?))
     }
+}
+
+/// The agent of the game's environment.
+fn agent(app: &App) -> Result<Rc<Agent>, WebError> {
+    let id = app.game.as_ref().ok_or(WebError::NoGame)?.id();
+    app.agents.get(id).map(Rc::clone).ok_or(WebError::NoAgent { id })
 }
 
 /// Sets the environments.

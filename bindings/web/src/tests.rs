@@ -111,6 +111,50 @@ fn the_table_has_what_a_form_needs() {
 }
 
 #[test]
+fn clues_are_what_the_episode_has_shown() {
+    environments();
+    for spec in memory_gym().specs() {
+        let mut state = start(spec.id, "5").unwrap();
+        let (mut coins, mut steps) = (0, 0);
+        while state["done"] == false && steps < 600 {
+            state = request(&json!("step_of_expert")).unwrap();
+            coins = coins.max(state["clues"]["coins"].as_array().map_or(0, Vec::len));
+            steps += 1;
+        }
+        let progress = |name: &str| {
+            state["progress"]
+                .as_array()
+                .unwrap()
+                .iter()
+                .find(|row| row["name"] == name)
+                .map_or(0, |row| row["value"].as_f64().unwrap() as usize)
+        };
+        let (clues, length) = (&state["clues"], |name: &str| state["clues"][name].as_array().map_or(0, Vec::len));
+        if spec.id.contains("MortarMayhem") {
+            let carried = clues["carried_out"].as_array().unwrap();
+            let shown = clues["commands"].as_array().unwrap();
+            // Those of MortarMayhemB are not shown.
+            assert!(
+                shown.is_empty() == spec.id.contains("MayhemB") && (shown.is_empty() || shown.starts_with(carried)),
+                "{}: {clues}",
+                spec.id
+            );
+            assert!(!spec.id.starts_with("Endless") || shown.len() > 3, "{clues}");
+            assert!(spec.id.starts_with("Endless") || carried.len() == progress("commands"), "{clues}");
+        } else if spec.id.contains("MysteryPath") {
+            assert_eq!(
+                (length("walked"), length("falls")),
+                (progress("tiles") + 1, progress("falls")),
+                "{}: {clues}",
+                spec.id
+            );
+        } else {
+            assert!(coins == 1 && length("coins") <= 1 && progress("coins") > 0, "{}: {clues}", spec.id);
+        }
+    }
+}
+
+#[test]
 fn a_wall_plays_all_environments_at_once() {
     environments();
     for expert in [false, true] {

@@ -1,10 +1,18 @@
 // The trained agents, and their results on the page.
 
-/** The environments with a trained agent of the page, in the file ID.safetensors; docs/train/agents.md describes how to make one. */
+/** The files of the page's agents, without their ending: the id of the environment, with `-none` for an agent without memory. */
 const IDS = ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0"];
+
+/** Minutes of their training on one core. */
+const MINUTES = { "MortarMayhem-Grid-v0": 12, "MysteryPath-Grid-v0": 17, "SearingSpotlights-v0": 9 };
+
+/** The environments with an agent that has a memory. */
+const PLAYED = IDS.filter((name) => !name.endsWith("-none"));
 
 export class Agents {
   #loaded = new Map();
+  /** The environments whose agent is that of an opened file. */
+  #own = new Set();
   #counts = new Map();
 
   constructor(engine) {
@@ -12,12 +20,17 @@ export class Agents {
   }
 
   has(id) {
-    return IDS.includes(id) || this.#loaded.has(id);
+    return PLAYED.includes(id) || this.#loaded.has(id);
+  }
+
+  /** The page's files of agents for an environment, that with memory first. */
+  names(id) {
+    return [id, `${id}-none`].filter((name) => IDS.includes(name));
   }
 
   /** Why there is no agent, or an empty string. */
   reason(id) {
-    return this.has(id) ? "" : `No agent was trained in ${id}; there is one for ${IDS.join(", ")}.`;
+    return this.has(id) ? "" : `No agent was trained in ${id}; there is one for ${PLAYED.join(", ")}.`;
   }
 
   /** The description in a loaded agent's file. */
@@ -29,16 +42,28 @@ export class Agents {
   async load(id) {
     if (!this.has(id)) throw new Error(this.reason(id));
     if (this.#loaded.has(id)) return this.#loaded.get(id);
-    const url = new URL(`${id}.safetensors`, import.meta.url);
+    return this.#read(await this.file(id));
+  }
+
+  /** The bytes of one of the page's files. */
+  async file(name) {
+    const url = new URL(`${name}.safetensors`, import.meta.url);
     const response = await fetch(url);
     if (!response.ok) throw new Error(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
-    return this.#read(new Uint8Array(await response.arrayBuffer()));
+    return new Uint8Array(await response.arrayBuffer());
   }
 
   /** Reads an agent's file; the agent plays the environment that it was trained in instead of another one. Returns its description. */
   open(bytes) {
+    const description = this.#read(bytes);
     this.#counts.clear();
-    return this.#read(bytes);
+    this.#own.add(description.env);
+    return description;
+  }
+
+  /** Whether an environment's agent is that of an opened file, which a link cannot name. */
+  isOwn(id) {
+    return this.#own.has(id);
   }
 
   #read(bytes) {
@@ -53,13 +78,14 @@ export class Agents {
   }
 
   /** Counts a finished episode of the agent, by environment and reset parameters. */
-  count({ id, options }, succeeded) {
+  count({ id, options }, succeeded, score) {
     const count = this.counted({ id, options });
-    this.#counts.set(key(id, options), { episodes: count.episodes + 1, successes: count.successes + Number(succeeded) });
+    const sums = { episodes: count.episodes + 1, successes: count.successes + Number(succeeded), score: count.score + score };
+    this.#counts.set(key(id, options), sums);
   }
 
   counted({ id, options }) {
-    return this.#counts.get(key(id, options)) ?? { episodes: 0, successes: 0 };
+    return this.#counts.get(key(id, options)) ?? { episodes: 0, successes: 0, score: 0 };
   }
 
   /** One sentence about the training. */
@@ -72,7 +98,9 @@ export class Agents {
       return score + (given.length ? ` with ${given.join(" and ")}` : "");
     };
     const measured = evaluation.map((result) => `; ${share(result)}`).join("");
-    return `${title}, trained for ${(steps / 1e6).toFixed(1)} million steps${measured}.`;
+    const trained = steps < 1e6 ? steps.toLocaleString("en") : `${(steps / 1e6).toFixed(1)} million`;
+    const minutes = !this.isOwn(id) && MINUTES[id] ? `, ${MINUTES[id]} minutes on one core` : "";
+    return `${title}, trained for ${trained} steps${minutes}${measured}.`;
   }
 }
 

@@ -3,8 +3,9 @@
 import { Engine } from "./engine.js";
 import { ParameterForm } from "./form.js";
 import { isTyping } from "./keys.js";
-import { episodeLink, readLink, wallLink } from "./link.js";
+import { episodeLink, randomSeed, readLink, wallLink } from "./link.js";
 import { Play } from "./play.js";
+import { questionOf } from "./tasks.js";
 import { Wall } from "./wall.js";
 
 const $ = (id) => document.getElementById(id);
@@ -26,8 +27,11 @@ function say(text, near = "pause", isNote = false) {
 
 const report = (error) => say(error.message);
 
-/** One of the paper's training seeds. */
-const randomSeed = () => String(crypto.getRandomValues(new Uint32Array(1))[0] % 100_000);
+/** Most bytes of an opened file; more do not fit into the engine's memory. */
+const LARGEST = 1e9;
+
+/** The environments of a page without a link; the first that an agent of the page plays. */
+const LANDING = ["Endless-MortarMayhem-v0", "MortarMayhem-Grid-v0"];
 
 /** The wall that the page shows unless the address names another. */
 const WALL = { wall: "all", count: "100", by: "expert" };
@@ -36,9 +40,12 @@ class App {
   constructor(engine) {
     this.engine = engine;
     this.specs = engine.request("specs");
-    this.first = this.specs[0].id;
     this.form = new ParameterForm($("fields"), (options) => engine.request({ check: { id: $("environment").value, options } }));
     this.play = new Play(engine, this.specs, { changed: (state) => this.#playing(state), report });
+    const landing = LANDING.find((id) => this.play.agents.has(id) && this.specs.some((spec) => spec.id === id));
+    this.first = landing ?? this.specs[0].id;
+    $("source").hidden = this.specs.every((spec) => questionOf(spec.id) === "");
+    this.hasLanding = Boolean(landing);
     this.wall = new Wall(engine, this.specs, {
       changed: (wall) => this.#address(wallLink(wall)),
       play: (episode) => this.start(episode),
@@ -54,6 +61,10 @@ class App {
   follow() {
     const link = readLink(location.hash);
     if (link.wall !== undefined) return this.showWall(link);
+    if (location.hash === "" && this.hasLanding) {
+      this.#view("play");
+      return this.play.demo({ id: this.first, options: {}, seed: randomSeed() });
+    }
     const episode = { id: link.id ?? this.first, options: link.options, seed: link.seed ?? randomSeed() };
     this.start(episode);
     if (!$("message").hidden) return;
@@ -75,6 +86,10 @@ class App {
   }
 
   showWall(link) {
+    if (!Wall.works) {
+      if (!this.play.state) this.start({ id: this.first, options: {}, seed: randomSeed() });
+      return say("The wall needs OffscreenCanvas, which this browser lacks. Everything else works.", "to-wall");
+    }
     this.#view("wall");
     say("");
     this.#allOption(true);
@@ -119,9 +134,11 @@ class App {
   #playing(state) {
     $("environment").value = state.id;
     $("seed").value = state.seed ?? "";
-    document.title = `${state.id} – Endless Gym`;
     this.form.show(this.play.spec, state.options);
-    const by = ["agent", "expert"].find((player) => player === this.play.player);
+    if (this.play.isDemo) return;
+    document.title = `${state.id} – Endless Gym`;
+    const { player, agents } = this.play;
+    const by = player === "expert" || (player === "agent" && !agents.isOwn(state.id)) ? player : undefined;
     this.#address(episodeLink({ ...state, seed: state.seed ?? "0", by }));
   }
 
@@ -166,7 +183,7 @@ class App {
       event.preventDefault();
       this.#open(event.dataTransfer.files[0]);
     });
-    $("copy").addEventListener("click", () => this.#copy());
+    for (const id of ["copy", "share"]) $(id).addEventListener("click", () => this.#copy(id));
     $("theme").addEventListener("click", () => {
       const dark = getComputedStyle(document.documentElement).colorScheme.startsWith("dark") ||
         (!document.documentElement.dataset.theme && matchMedia("(prefers-color-scheme: dark)").matches);
@@ -180,7 +197,8 @@ class App {
     addEventListener("click", ({ target, detail }) => {
       if (target.closest("#play, header") && (detail > 0 || target.closest("button")) && !isTyping(target) && !target.matches("select, label")) give();
     });
-    addEventListener("change", ({ target }) => target.matches("select, #seed, #pace") && give());
+    // An arrow that changes a control keeps the keys there.
+    addEventListener("change", ({ target }) => target.matches("select:not(:focus-visible)") && give());
     addEventListener("keydown", ({ target, code }) => {
       if (code === "Escape") say("");
       if ((code === "Enter" || code === "Escape") && target.matches("#seed, #pace")) give();
@@ -207,6 +225,7 @@ class App {
     $("file").value = "";
     if (!file) return;
     try {
+      if (file.size > LARGEST) throw new Error(`the file has ${(file.size / 1e9).toFixed(1)} GB; recordings and agents have at most ${LARGEST / 1e9} GB`);
       if (file.name.endsWith(".safetensors")) return this.#openAgent(new Uint8Array(await file.arrayBuffer()));
       const { episodes, steps, differences, first } = this.play.open(new Uint8Array(await file.arrayBuffer()));
       this.#view("play");
@@ -227,12 +246,12 @@ class App {
     this.play.playAgent({ id: env, options: {}, seed: seed ?? randomSeed() });
   }
 
-  async #copy() {
+  async #copy(near) {
     try {
       await navigator.clipboard.writeText(location.href);
-      say("The link to this episode is in the clipboard.", "copy", true);
+      say("The link to this episode is in the clipboard.", near, true);
     } catch {
-      say(`The browser refuses access to the clipboard; the link is ${location.href}`, "copy");
+      say(`The browser refuses access to the clipboard; the link is ${location.href}`, near);
     }
   }
 }
@@ -267,7 +286,7 @@ try {
   requestAnimationFrame((now) => (app.firstFrame = now));
 } catch (error) {
   $("overlay").hidden = true;
-  report(error);
+  say(globalThis.WebAssembly ? error.message : "This page needs WebAssembly, which this browser lacks or has switched off.");
 }
 
 if ("serviceWorker" in navigator) navigator.serviceWorker.register("worker.js").catch(() => {});

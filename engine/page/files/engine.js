@@ -11,8 +11,10 @@ export class Engine {
 
   /** Loads the engine from the page's folder. */
   static async load(url = new URL("engine.wasm", import.meta.url)) {
-    const response = await fetch(url);
-    if (!response.ok) throw new EngineError(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
+    const response = await fetch(url).catch(() => ({ statusText: "no answer" }));
+    if (!response.ok) {
+      throw new EngineError(`The engine cannot be loaded (${url}: ${response.status ?? ""} ${response.statusText}). Load the page again; if this stays, its folder lacks the file.`);
+    }
     return Engine.of(await WebAssembly.compile(await response.arrayBuffer()));
   }
 

@@ -1,5 +1,8 @@
 // The address: environment, seed, player and reset parameters, or a wall.
 
+/** One of the paper's training seeds. */
+export const randomSeed = () => String(crypto.getRandomValues(new Uint32Array(1))[0] % 100_000);
+
 /** Parses an address. */
 export function readLink(hash) {
   const fields = new URLSearchParams(hash.replace(/^#/, ""));

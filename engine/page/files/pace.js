@@ -3,6 +3,9 @@
 /** Maximum number of steps per animation frame; steps beyond it are dropped. */
 const MOST = 200;
 
+/** Milliseconds that a frame makes up for at most, so that no step is missed while the page was hidden or busy. */
+const LONGEST = 100;
+
 export class Pace {
   #last = null;
   #due = 0;
@@ -33,7 +36,7 @@ export class Pace {
 
   #frame(now) {
     if (!this.#running) return;
-    if (this.#last !== null) this.#due += ((now - this.#last) / 1000) * this.stepsPerSecond;
+    if (this.#last !== null) this.#due += (Math.min(now - this.#last, LONGEST) / 1000) * this.stepsPerSecond;
     this.#last = now;
     const count = Math.min(Math.floor(this.#due), MOST);
     this.#due = Math.min(this.#due - count, 1);

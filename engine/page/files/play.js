@@ -1,14 +1,17 @@
 // The episode on the screen: its player, its pace, and its display.
 
 import { Agents } from "./agents.js";
+import { Answer } from "./answer.js";
 import { ActionControls } from "./controls.js";
 import { flash } from "./flash.js";
 import { Directions, isTyping } from "./keys.js";
+import { randomSeed } from "./link.js";
 import { live } from "./live.js";
 import { showMemory } from "./memory.js";
 import { Pace } from "./pace.js";
+import { Rival } from "./rival.js";
 import { enable, tone } from "./sound.js";
-import { actionFor, actionText, choiceName, commandsOf, legendOf, outcomeOf, steering, TASKS, waits } from "./tasks.js";
+import { actionFor, actionText, choiceName, commandsOf, legendOf, outcomeOf, questionOf, scoreNumber, steering, TASKS, waits } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 
@@ -32,9 +35,13 @@ export class Play {
     this.report = report;
     this.state = null;
     this.player = "person";
+    /** Whether an agent plays until the visitor starts. */
+    this.isDemo = false;
     /** The reset parameters before an agent played with those of its training. */
     this.before = null;
     this.agents = new Agents(engine);
+    this.answer = new Answer(engine, this.agents);
+    this.rival = new Rival(engine, this.agents);
     this.say = live($("status"));
     this.directions = new Directions(() => this.#takeOver());
     this.directions.attach($("pad"));
@@ -49,30 +56,45 @@ export class Play {
   }
 
   /** Starts an episode of the given environment. Throws the engine's error. */
-  start({ id, options, seed }, player = "person") {
+  start({ id, options, seed }, player = "person", isDemo = false) {
     const state = this.engine.request({ start: { id, options, seed } });
-    this.player = player;
+    [this.player, this.isDemo] = [player, isDemo];
     if (player !== "agent") this.before = null;
     this.#begin(state);
     if (player === "expert" || player === "agent") this.play();
   }
 
   /** Loads the agent of an environment and lets it play. Reset parameters default to those of its training. */
-  async playAgent({ id, options, seed }) {
+  async playAgent({ id, options, seed }, isDemo = false) {
     const { state } = this;
     try {
       await this.agents.load(id);
     } catch (error) {
-      return this.report(error);
+      // The landing does without.
+      return isDemo ? undefined : this.report(error);
     }
     // The user may have started another episode meanwhile.
     if (this.state !== state) return;
     this.before = options;
-    this.#attempt(() => this.start({ id, options: { ...this.agents.options(id), ...options }, seed }, "agent"));
+    this.#attempt(() => this.start({ id, options: { ...this.agents.options(id), ...options }, seed }, "agent", isDemo));
+  }
+
+  /** Lets an agent play until the visitor starts. */
+  async demo(episode) {
+    this.start(episode, "person", true);
+    await this.playAgent(episode, true);
+    if (this.isDemo && matchMedia("(prefers-reduced-motion: reduce)").matches) this.stop();
+  }
+
+  /** Ends the demonstration with an episode of the visitor's own, which nobody has seen yet. */
+  #startOwn() {
+    this.#attempt(() => this.start({ ...this.state, seed: randomSeed() }));
+    this.play();
   }
 
   /** Lets a person, the expert or the agent play. Expert and agent must see an episode from its start. */
   choose(player) {
+    if (this.isDemo && player === "person") return this.#startOwn();
     if (!this.state || player === this.player) return;
     // A recording may have no seed.
     const episode = { ...this.state, options: this.before ?? this.state.options, seed: this.state.seed ?? "0" };
@@ -119,10 +141,10 @@ export class Play {
   }
 
   /** Starts the episode whose seed is larger by `by`. */
-  otherSeed(by) {
+  otherSeed(by, isDemo = false) {
     if (!this.state) return;
     const seed = BigInt.asUintN(64, BigInt(this.state.seed ?? 0) + BigInt(by)).toString();
-    this.#attempt(() => this.start({ ...this.state, options: this.#options(), seed }, this.player === "trace" ? "person" : this.player));
+    this.#attempt(() => this.start({ ...this.state, options: this.#options(), seed }, this.player === "trace" ? "person" : this.player, isDemo));
   }
 
   /** Plays one step and stops. */
@@ -149,7 +171,8 @@ export class Play {
     this.state = state;
     this.directions.clear();
     if (other) {
-      $("task").firstChild.textContent = TASKS[state.id] ?? this.spec.summary;
+      $("question").textContent = questionOf(state.id);
+      $("summary").textContent = TASKS[state.id] ?? this.spec.summary;
       this.#legend();
       this.#pad();
       this.controls.show(this.spec);
@@ -157,6 +180,8 @@ export class Play {
       this.#originalPace();
     }
     this.changed(state);
+    const isRivalled = this.player === "agent" && !this.agents.isOwn(state.id) && this.agents.names(state.id).length > 1;
+    this.rival.begin(state, isRivalled).catch(this.report);
     this.#show();
     $("view").setAttribute("aria-label", `Ground truth of ${state.id}`);
   }
@@ -184,7 +209,9 @@ export class Play {
   }
 
   #takeOver() {
-    if (!this.active || !this.state || this.state.done) return;
+    if (!this.active || !this.state) return;
+    if (this.isDemo) return this.#startOwn();
+    if (this.state.done) return;
     if (this.player !== "person") {
       this.player = "person";
       this.changed(this.state);
@@ -201,13 +228,13 @@ export class Play {
         this.state = this.engine.request(by ?? { step: { action: actionFor(this.spec, directions, this.controls.action()) } });
         this.#sound();
         this.#flash();
-        if (this.player === "agent" && this.state.done) this.agents.count(this.state, outcomeOf(this.state) === "success");
+        if (this.player === "agent" && this.state.done) this.agents.count(this.state, outcomeOf(this.state) === "success", scoreNumber(this.state));
       }
     });
     if (this.#over()) {
       this.pace.stop();
       // A running agent plays one episode after the other.
-      if (this.player === "agent" && this.state.done && !single) this.following = setTimeout(() => this.otherSeed(1), BREAK);
+      if (this.player === "agent" && this.state.done && !single) this.following = setTimeout(() => this.otherSeed(1, this.isDemo), BREAK);
     }
     this.#show();
   }
@@ -258,8 +285,11 @@ export class Play {
     $("arrows").textContent = arrows;
     $("words").textContent = words;
     const running = this.pace.running;
-    $("pause").textContent = running ? "Pause" : state.length === 0 ? "Start" : "Continue";
-    $("pause").disabled = $("step").disabled = this.#over();
+    $("pause").textContent = this.isDemo ? "Play" : running ? "Pause" : state.length === 0 ? "Start" : "Continue";
+    $("pause").disabled = $("step").disabled = this.#over() && !this.isDemo;
+    document.body.classList.toggle("demo", this.isDemo);
+    this.rival.follow(state, spec);
+    this.answer.show(this.player === "person" && state.done ? state : null);
     $("expert").disabled = !spec.has_expert;
     for (const player of ["person", "expert", "agent"]) $(player).setAttribute("aria-pressed", String(this.player === player));
     this.#agent();
@@ -268,9 +298,9 @@ export class Play {
     const text = this.#text();
     $("overlay").hidden = text === "";
     $("said").textContent = text;
-    $("choices").hidden = !this.#over();
+    $("choices").hidden = !this.#over() || this.isDemo;
     // On the picture then; their places stay, so that nothing moves.
-    for (const id of ["restart", "next"]) $(id).style.visibility = this.#over() ? "hidden" : "";
+    for (const id of ["pause", "restart", "next"]) $(id).style.visibility = this.#over() && !this.isDemo ? "hidden" : "";
   }
 
   #agent() {
@@ -278,15 +308,15 @@ export class Play {
     const reason = this.agents.reason(state.id);
     // Not `disabled`, so that the keyboard still reaches the button and a screen reader reads the reason.
     $("agent").setAttribute("aria-disabled", String(reason !== ""));
-    $("agent").title = reason;
-    $("agent-reason").textContent = reason;
+    $("agent-reason").textContent = $("agent").hidden ? "" : reason;
     // Shown before the agent plays, too, so that nothing moves when it does.
-    $("memory").hidden = reason !== "";
-    if (reason === "") showMemory(state, this.agents, player === "agent");
+    $("memory").hidden = state.clues === null;
+    if (state.clues) showMemory(state, this.agents, player === "person");
   }
 
   #said({ recording }) {
     const end = this.#over() ? ` ${this.#text()}` : "";
+    if (this.isDemo) return "An agent plays. Play or a direction starts an episode of your own.";
     if (this.player === "person") return `You play.${end}`;
     const who = { expert: "The expert plays", agent: "The agent plays" }[this.player] ?? `Recording, episode ${recording.episode + 1} of ${recording.episodes}`;
     return end === "" ? `${who}. A direction takes over.` : `${who}.${end}`;
@@ -295,6 +325,7 @@ export class Play {
   /** What is written on the picture. */
   #text() {
     const { state } = this;
+    if (this.isDemo && !state.done) return "";
     if (this.#over() && state.done) {
       const success = { success: "Done", failure: "Failed", end: "Episode over" }[outcomeOf(state)];
       return `${success}: return ${round(state.return)} in ${state.length} steps.`;
@@ -332,7 +363,7 @@ export class Play {
   }
 
   #listen() {
-    const go = () => (this.pace.running ? this.stop() : this.play());
+    const go = () => (this.isDemo ? this.#startOwn() : this.pace.running ? this.stop() : this.play());
     const tasks = { restart: () => this.restart(), next: () => this.otherSeed(1) };
     $("pause").addEventListener("click", go);
     $("observation").parentElement.addEventListener("click", (event) => !event.target.closest("button") && go());
@@ -354,6 +385,7 @@ export class Play {
       PageDown: tasks.next,
       PageUp: () => this.otherSeed(-1),
     };
+    document.addEventListener("visibilitychange", () => document.hidden && this.player === "person" && this.pace.running && this.stop());
     addEventListener("keydown", (event) => {
       const action = keys[event.code];
       if (!this.active || !action || event.ctrlKey || event.metaKey || event.altKey || isTyping(event.target)) return;

@@ -3,6 +3,19 @@
 const MORTAR = "Remember the commands, shown one by one: an arrow means a neighbouring tile, a crossed circle stay.";
 const GRID = "Left and right turn, up walks ahead.";
 
+/** What an environment asks of a player, by a part of its id. */
+const QUESTIONS = {
+  MortarMayhemB: "Can you follow the commands?",
+  MortarMayhem: "How many can you remember?",
+  MysteryPath: "Do you remember the way?",
+  SearingSpotlights: "Where was the coin?",
+};
+
+/** The question of an environment; empty for others than those of Memory Gym. */
+export function questionOf(id) {
+  return Object.entries(QUESTIONS).find(([name]) => id.includes(name))?.[1] ?? "";
+}
+
 /** Two sentences for each id. */
 export const TASKS = {
   "MortarMayhem-v0":
@@ -117,6 +130,34 @@ const ARROWS = { stay: "⊗", right: "→", left: "←", up: "↑", down: "↓",
 /** The sign of a command. */
 export function arrowOf(command) {
   return ARROWS[command];
+}
+
+/** What is counted in an episode: the longest sequence of commands, or what the engine counts first. */
+function counted({ progress, clues, done }) {
+  const [first] = progress;
+  if (!first) return null;
+  if (first.name !== "commands" || first.of !== null) return first;
+  // A sequence counts once it is carried out whole.
+  const { commands, carried_out: carried } = clues;
+  const whole = !done && commands.length > 0 && commands.every((command, place) => carried[place] === command);
+  return { name: "commands", value: Math.max(0, commands.length - (whole ? 0 : 1)), of: null };
+}
+
+/** A player's score in an episode so far, such as `6` or `3 of 5`. */
+export function scoreOf(state) {
+  const { value, of } = counted(state) ?? { value: state.return, of: null };
+  const text = (number) => String(Math.round(number * 100) / 100);
+  return of === null ? text(value) : `${text(value)} of ${text(of)}`;
+}
+
+/** The number of that score. */
+export function scoreNumber(state) {
+  return counted(state)?.value ?? state.return;
+}
+
+/** What the score counts, such as `commands`. */
+export function unitOf(state) {
+  return counted(state)?.name ?? "return";
 }
 
 /** How an episode ended: `success`, `failure`, `end` if the environment defines no success, or null before its end. */

@@ -23,7 +23,8 @@ const pace = new Pace(25, (count) => {
     return fail(error);
   }
   const seconds = (performance.now() - since.time) / 1000;
-  if (seconds * 1000 >= INTERVAL) report(since.steps / seconds);
+  // The first steps, in which experts plan, tell nothing about the rest.
+  if (seconds * 1000 >= INTERVAL) report(since.isFirst ? null : since.steps / seconds);
 });
 
 function draw() {
@@ -31,8 +32,8 @@ function draw() {
 }
 
 /** Tells the page the state, and how often each environment stepped per second. */
-function report(rate) {
-  since = { time: performance.now(), steps: 0 };
+function report(rate, isFirst = false) {
+  since = { time: performance.now(), steps: 0, isFirst };
   postMessage({ state, rate });
 }
 
@@ -49,11 +50,11 @@ const TASKS = {
     state = engine.request({ wall: request });
     Object.assign(canvas, { width: state.width, height: state.height });
     draw();
-    report(null);
+    report(null, true);
     pace.start();
   },
   run({ running }) {
-    since = { time: performance.now(), steps: 0 };
+    since = { time: performance.now(), steps: 0, isFirst: true };
     if (running) pace.start();
     else pace.stop();
   },

@@ -7,8 +7,14 @@ const $ = (id) => document.getElementById(id);
 export class Wall {
   #worker = null;
 
+  /** Whether the browser has what a wall needs. */
+  static works = "transferControlToOffscreen" in HTMLCanvasElement.prototype;
+
   /** Steps of each environment per second; null before the first report. */
   rate = null;
+
+  /** The place of the environment that the keyboard has chosen. */
+  #place = 0;
 
   /** Calls `changed(wall)` when a wall starts, and `play(episode)` when the user clicks one of its environments. */
   constructor(engine, specs, { changed, play, report }) {
@@ -19,7 +25,14 @@ export class Wall {
     for (const control of ["wall-count", "wall-by"]) {
       $(control).addEventListener("change", () => this.start({ ...this.link, count: $("wall-count").value, by: $("wall-by").value }));
     }
-    $("picture").addEventListener("click", (event) => this.#choose(event));
+    $("picture").addEventListener("click", (event) => this.#play(this.#placeAt(event)));
+    $("picture").addEventListener("pointermove", (event) => {
+      const place = this.#placeAt(event);
+      $("picture").title = this.state && place < this.#count() ? this.#name(place) : "";
+    });
+    $("picture").addEventListener("keydown", (event) => this.#key(event));
+    $("picture").addEventListener("focus", () => this.#choose(this.#place));
+    $("picture").addEventListener("blur", () => ($("chosen").hidden = true));
   }
 
   /** Starts a wall of the environment `wall`, or of all of them. */
@@ -82,13 +95,14 @@ export class Wall {
     if (isNew) {
       $("picture").style.aspectRatio = `${state.width} / ${state.height}`;
       $("picture").style.setProperty("--wall", state.width / state.height);
+      this.#names();
+      $("chosen").hidden = true;
       this.changed(this.link);
     }
     this.#table();
     if (rate === null) return;
     this.rate = rate;
-    const number = state.groups.reduce((sum, group) => sum + group.num_envs, 0);
-    this.say(`${Math.round(rate * number).toLocaleString("en")} steps per second. A click on an environment plays it.`);
+    if ($("chosen").hidden) this.say(`${Math.round(rate * this.#count()).toLocaleString("en")} steps per second.`);
   }
 
   #table() {
@@ -96,18 +110,68 @@ export class Wall {
     $("wall-table").replaceChildren(...this.state.groups.map((group) => {
       const row = document.createElement("tr");
       const cells = [group.id, group.episodes, number(group.mean_return), number(group.mean_length)];
-      row.append(...cells.map((text) => Object.assign(document.createElement("td"), { textContent: text })));
+      row.append(...cells.map((textContent, index) => Object.assign(document.createElement(index === 0 ? "th" : "td"), { textContent })));
+      row.firstChild.scope = "row";
       return row;
     }));
   }
 
-  #choose(event) {
-    if (!this.state) return;
-    const { left, top, width, height } = event.target.getBoundingClientRect();
-    const { columns, groups } = this.state;
-    const number = groups.reduce((sum, group) => sum + group.num_envs, 0);
-    const row = Math.floor(((event.clientY - top) / height) * Math.ceil(number / columns));
-    const place = row * columns + Math.floor(((event.clientX - left) / width) * columns);
-    if (place < number) this.#send("tile", { place });
+  #count() {
+    return this.state.groups.reduce((sum, group) => sum + group.num_envs, 0);
+  }
+
+  /** Writes each group's id over its first environment. */
+  #names() {
+    let place = 0;
+    $("wall-names").replaceChildren(...this.state.groups.map(({ id, num_envs: number }) => {
+      const name = Object.assign(document.createElement("span"), { textContent: id });
+      this.#put(name, place, Math.min(number, this.state.columns - (place % this.state.columns)));
+      place += number;
+      return name;
+    }));
+  }
+
+  /** Lays an element over environments from a place on. */
+  #put(element, place, width = 1) {
+    const { columns } = this.state;
+    const [column, row] = [100 / columns, 100 / Math.ceil(this.#count() / columns)];
+    const sides = { left: (place % columns) * column, top: Math.floor(place / columns) * row, width: width * column, height: row };
+    for (const [side, share] of Object.entries(sides)) element.style.setProperty(side, `${share}%`);
+  }
+
+  #name(place) {
+    let rest = place;
+    const group = this.state.groups.find(({ num_envs: number }) => (rest < number ? true : ((rest -= number), false)));
+    return `${group.id}, ${rest + 1} of ${group.num_envs}`;
+  }
+
+  #placeAt({ clientX, clientY }) {
+    if (!this.state) return Infinity;
+    const { left, top, width, height } = $("picture").getBoundingClientRect();
+    const { columns } = this.state;
+    const row = Math.floor(((clientY - top) / height) * Math.ceil(this.#count() / columns));
+    return row * columns + Math.floor(((clientX - left) / width) * columns);
+  }
+
+  #play(place) {
+    if (this.state && place < this.#count()) this.#send("tile", { place });
+  }
+
+  /** Marks and names the environment that Enter plays. */
+  #choose(place) {
+    if (!this.state || !$("picture").matches(":focus-visible")) return;
+    this.#place = Math.max(0, Math.min(place, this.#count() - 1));
+    this.#put($("chosen"), this.#place);
+    $("chosen").hidden = false;
+    $("picture").ariaLabel = `Many environments; chosen: ${this.#name(this.#place)}`;
+    this.say(this.#name(this.#place));
+  }
+
+  #key(event) {
+    const { columns } = this.state ?? {};
+    const by = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: -columns, ArrowDown: columns }[event.code];
+    if (event.code === "Enter") this.#play(this.#place);
+    else if (by && this.#place + by >= 0 && this.#place + by < this.#count()) this.#choose(this.#place + by);
+    if (by || event.code === "Enter") event.preventDefault();
   }
 }

@@ -2,11 +2,14 @@
 
 const CACHE = `endless-gym-${VERSION}`;
 
+/** The end of the name of an agent's file. */
+const AGENT = ".safetensors";
+
 self.addEventListener("install", (event) => {
   const fill = async () => {
     const cache = await caches.open(CACHE);
-    // Bypass the browser's HTTP cache, which may hold files of another version.
-    await cache.addAll(["./", ...FILES].map((file) => new Request(file, { cache: "reload" })));
+    // Bypass the browser's HTTP cache, which may hold files of another version. Agents are kept once they were chosen.
+    await cache.addAll(["./", ...FILES.filter((file) => !file.endsWith(AGENT))].map((file) => new Request(file, { cache: "reload" })));
     await self.skipWaiting();
   };
   event.waitUntil(fill());
@@ -24,6 +27,13 @@ self.addEventListener("activate", (event) => {
 
 self.addEventListener("fetch", (event) => {
   if (event.request.method !== "GET") return;
-  const answer = async () => (await (await caches.open(CACHE)).match(event.request, { ignoreSearch: true })) ?? fetch(event.request);
+  const answer = async () => {
+    const cache = await caches.open(CACHE);
+    const known = await cache.match(event.request, { ignoreSearch: true });
+    if (known) return known;
+    const response = await fetch(event.request);
+    if (response.ok && event.request.url.endsWith(AGENT)) await cache.put(event.request, response.clone());
+    return response;
+  };
   event.respondWith(answer());
 });

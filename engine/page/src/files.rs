@@ -12,8 +12,9 @@ const ENGINE: &str = "engine.wasm";
 /// The service worker, which lacks the list of the files that it caches.
 const WORKER: &str = "worker.js";
 
-/// The end of the name of a trained agent's file, after the id of its environment.
+/// The end of the name of a trained agent's file, after the id of its environment, and what comes before it for one without memory.
 const AGENT: &str = ".safetensors";
+const NO_MEMORY: &str = "-none";
 
 /// The file of that name, such as `index.html`, compressed with gzip.
 ///
@@ -57,7 +58,10 @@ pub fn names(engine: &[u8], id: &str) -> bool {
 /// assert!(worker.starts_with(b"const VERSION = \""));
 /// ```
 pub fn files(engine: &[u8], has_id: impl Fn(&str) -> bool) -> Vec<(&'static str, Vec<u8>)> {
-    let is_kept = |name: &str| name != ENGINE && name.strip_suffix(AGENT).is_none_or(&has_id);
+    let is_kept = |name: &str| {
+        name != ENGINE
+            && name.strip_suffix(AGENT).is_none_or(|agent| has_id(agent.strip_suffix(NO_MEMORY).unwrap_or(agent)))
+    };
     let sources = FILES.iter().filter(|(name, _)| is_kept(name)).map(|(name, bytes)| (*name, decompress(bytes)));
     let mut files: Vec<_> = sources.chain([(ENGINE, engine.to_vec())]).collect();
     let mut checksum = crc32fast::Hasher::new();

@@ -30,6 +30,14 @@ fn axe_finds_nothing_serious() {
     // Colours change without a transition.
     let reduced = json!({"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]});
     browser.call("Emulation.setEmulatedMedia", &reduced);
+    visit(&mut browser, &server, "");
+    browser.wait("endless.play.isDemo && endless.play.player === 'agent'");
+    browser.value(&format!("{axe}; 0"));
+    assert_accessible(&mut browser, "the landing");
+    for id in ["MortarMayhem-Grid-v0", "MysteryPath-v0"] {
+        browser.value(&format!("endless.start({{ id: '{id}', options: {{}}, seed: '3' }}); while (!endless.play.state.done) endless.play.oneStep()"));
+        assert_accessible(&mut browser, "the answer");
+    }
     visit(&mut browser, &server, "env=SearingSpotlights-v0&seed=1");
     browser.value(&format!("{axe}; 0"));
     browser.value("document.querySelectorAll('details').forEach((details) => (details.open = true))");
@@ -98,6 +106,24 @@ fn the_page_tells_what_it_waits_for_and_what_it_lacks() {
     browser.load(&server.url());
     browser.wait("!document.getElementById('message').hidden");
     assert_eq!(browser.value("document.getElementById('overlay').hidden"), true);
+    let said = browser.value("document.getElementById('message').textContent");
+    assert!(said.as_str().unwrap().starts_with("The engine cannot be loaded ("), "{said}");
+    browser.call("Network.setBlockedURLs", &json!({"urls": []}));
+    // Without parts of the browser.
+    for (lack, link, message) in [
+        ("delete globalThis.WebAssembly", "", "This page needs WebAssembly"),
+        (
+            "delete HTMLCanvasElement.prototype.transferControlToOffscreen",
+            "#wall=all",
+            "The wall needs OffscreenCanvas",
+        ),
+    ] {
+        let script = browser.call("Page.addScriptToEvaluateOnNewDocument", &json!({"source": lack}));
+        browser.load("about:blank");
+        browser.load(&format!("{}{link}", server.url()));
+        browser.wait(&format!("document.getElementById('message')?.textContent.startsWith('{message}')"));
+        browser.call("Page.removeScriptToEvaluateOnNewDocument", &script);
+    }
     // Without JavaScript.
     browser.call("Emulation.setScriptExecutionDisabled", &json!({"value": true}));
     browser.load("about:blank");

@@ -45,7 +45,7 @@ fn an_agent_plays_from_memory() {
         let state = browser.value(STATE);
         let (of, done) =
             (state["progress"][0]["of"].as_u64().unwrap(), state["progress"][0]["value"].as_u64().unwrap());
-        assert_eq!(state["clues"].as_array().unwrap().len() as u64, of, "every command was shown");
+        assert_eq!(state["clues"]["commands"].as_array().unwrap().len() as u64, of, "every command was shown");
         let kinds = clues(&mut browser);
         assert_eq!(kinds.iter().filter(|kind| *kind == "done").count() as u64, done);
         assert_eq!(kinds.iter().any(|kind| kind == "failed"), done < of);
@@ -114,6 +114,7 @@ fn only_environments_with_an_agent_offer_it() {
         if !reason.is_empty() {
             let expected = format!("No agent was trained in {}; there is one for {}", spec.id, WITH_AGENT.join(", "));
             assert!(reason.starts_with(&expected), "{reason}");
+            assert!(browser.value("document.getElementById('agent-reason').offsetWidth").as_u64() > Some(100));
             browser.value("document.getElementById('agent').click()");
             assert_eq!(browser.value("endless.play.player"), "person");
         }
@@ -161,6 +162,9 @@ fn an_agent_of_a_file_plays() {
         assert_eq!((&state["id"], &state["seed"]), (&json!(ID), &json!("7")));
         assert_eq!(state["options"], json!({"command_count": "[1,2]"}));
         assert_eq!(browser.value("endless.play.player"), "agent");
+        // Who follows a link does not have the file.
+        assert_eq!(browser.value("location.hash.includes('by=')"), false);
+        assert!(!text(&mut browser, "trained").contains("0.0 million"), "{}", text(&mut browser, "trained"));
         browser.value("endless.play.stop(); while (!endless.play.state.done) endless.play.oneStep()");
         assert!(text(&mut browser, "successes").ends_with(" of 1."), "{}", text(&mut browser, "successes"));
     }

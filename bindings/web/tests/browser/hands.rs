@@ -69,6 +69,8 @@ fn an_episode_that_ends_offers_the_next_one_on_the_picture() {
         assert_eq!((browser.value(shown), browser.value(offers)), (json!(false), json!(2)));
         browser.value(end);
         assert_eq!((browser.value(shown), browser.value(offers)), (json!(true), json!(2)));
+        let dead = "document.getElementById('pause').checkVisibility({ visibilityProperty: true })";
+        assert_eq!(browser.value(dead), false, "there is nothing to continue");
         if act.starts_with('#') {
             browser.click(act);
         } else {
@@ -186,6 +188,106 @@ fn experts_of_a_wall_do_not_hold_up_the_page() {
     // Where the page itself steps, there is at least one step in every frame.
     assert!(rates[0].as_f64() > rates[1].as_f64().map(|steps| 2.0 * steps), "{rates}");
     assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn a_hidden_page_pauses_and_misses_no_step() {
+    let (server, mut browser) = (PageServer::start("web"), start("hidden"));
+    visit(&mut browser, &server, "env=MortarMayhem-v0&seed=3");
+    browser.press("Space");
+    browser.wait(&format!("{LENGTH} > 0"));
+    browser.value(
+        "Object.defineProperty(document, 'hidden', { value: true, configurable: true }); document.dispatchEvent(new Event('visibilitychange')); 0",
+    );
+    assert_eq!(browser.value("endless.play.pace.running"), false);
+    // A frame that comes ten seconds after the last one.
+    let late = "(async () => { const { Pace } = await import('./pace.js'); const frames = []; const real = globalThis.requestAnimationFrame; \
+                globalThis.requestAnimationFrame = (frame) => frames.push(frame); let steps = 0; const pace = new Pace(25, (count) => (steps += count)); \
+                pace.start(); for (const now of [0, 20, 10000, 10020]) frames.shift()(now); globalThis.requestAnimationFrame = real; return steps })()";
+    assert!(browser.value(late).as_u64() <= Some(4), "{}", browser.value(late));
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn a_control_that_the_keyboard_has_reached_keeps_the_arrows() {
+    let (server, mut browser) = (PageServer::start("web"), start("arrows"));
+    visit(&mut browser, &server, "env=MortarMayhem-v0&seed=3");
+    browser.value("document.querySelectorAll('details').forEach((details) => (details.open = true))");
+    for control in ["environment", "pace"] {
+        // The keyboard has been used last, so that the focus is visible.
+        browser.press("Tab");
+        browser.value(&format!("document.getElementById('{control}').focus()"));
+        let change = format!(
+            "(() => {{ const control = document.getElementById('{control}'); if (control.options) control.selectedIndex += 1; \
+             else control.value = 30; for (const kind of ['input', 'change']) control.dispatchEvent(new Event(kind, {{ bubbles: true }})); \
+             return document.activeElement.id }})()"
+        );
+        assert_eq!(browser.value(&change), control);
+    }
+    assert_eq!(
+        browser.value("[endless.play.state.id, endless.play.pace.running]"),
+        json!(["MortarMayhem-Grid-v0", false])
+    );
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn an_environment_of_the_wall_is_named_and_played_by_the_keyboard() {
+    let (server, mut browser) = (PageServer::start("web"), start("wall-keys"));
+    visit(&mut browser, &server, "wall=all&count=40&by=random");
+    browser.wait("endless.wall.state");
+    let ids: Vec<&str> = memory_gym().specs().map(|spec| spec.id).collect();
+    let names =
+        |selector: &str| format!("[...document.querySelectorAll('{selector}')].map((name) => name.textContent)");
+    assert_eq!(browser.value(&names("#wall-names span")), json!(ids));
+    assert_eq!(browser.value(&names("#wall-table th[scope=row]")), json!(ids));
+    // The hint is in view, and the pointer says that there is something to press.
+    let hint = "document.getElementById('wall-hint').getBoundingClientRect().bottom <= innerHeight";
+    assert_eq!(browser.value(hint), true);
+    assert_eq!(browser.value("getComputedStyle(document.getElementById('picture')).cursor"), "pointer");
+    browser.press("Tab");
+    browser.value("document.getElementById('picture').focus()");
+    for key in ["ArrowDown", "ArrowRight", "ArrowRight"] {
+        browser.press(key);
+    }
+    // Row 1, column 2 of rows of ten, with four environments of each id.
+    assert_eq!(
+        browser.value("document.getElementById('picture').ariaLabel"),
+        format!("Many environments; chosen: {}, 1 of 4", ids[3])
+    );
+    let chosen = "['#chosen', '#picture'].map((id) => document.querySelector(id).getBoundingClientRect())";
+    let offset = format!(
+        "(([tile, all]) => [tile.left - all.left, tile.top - all.top].map((place, i) => Math.round(place / [all.width, all.height][i] * 40)))({chosen})"
+    );
+    assert_eq!(browser.value(&offset), json!([8, 10]));
+    browser.enter();
+    browser.wait("endless.play.active && endless.play.state");
+    assert_eq!(browser.value(STATE)["id"], ids[3]);
+    // The first figure of steps per second is not that of the steps that wait for the start.
+    visit(&mut browser, &server, "wall=MortarMayhem-v0&count=100&by=expert");
+    browser.wait("endless.wall.rate !== null");
+    assert!(browser.value("endless.wall.rate").as_f64() > Some(15.0));
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn a_file_that_is_too_large_is_named_so() {
+    let (server, mut browser) = (PageServer::start("web"), start("large"));
+    visit(&mut browser, &server, "env=MortarMayhem-v0&seed=3");
+    // It takes no space on the disk.
+    let path = std::env::temp_dir().join(format!("endless-large-{}.gz", std::process::id()));
+    std::fs::File::create(&path).unwrap().set_len(3_000_000_000).unwrap();
+    browser.choose("#file", &path);
+    browser.wait("!document.getElementById('message').hidden");
+    std::fs::remove_file(path).unwrap();
+    let said = browser.value("document.getElementById('message').textContent");
+    assert!(
+        said.as_str().unwrap().ends_with(": the file has 3.0 GB; recordings and agents have at most 1 GB"),
+        "{said}"
+    );
 }
 
 /// The page's frames and the wall's steps per second, over some milliseconds.

@@ -5,6 +5,7 @@ mod agents;
 #[path = "../../../../tests/integration/support/chromium.rs"]
 mod chromium;
 mod hands;
+mod landing;
 mod layout;
 mod own;
 mod server;

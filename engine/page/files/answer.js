@@ -1,0 +1,53 @@
+// The answer at the end of a visitor's episode: the scores of the visitor and of the page's agents, which play the same episode, and what
+// was to be remembered.
+
+import { clueNode } from "./memory.js";
+import { scoreOf } from "./tasks.js";
+
+const $ = (id) => document.getElementById(id);
+
+export class Answer {
+  #worker = null;
+  #shown = null;
+
+  constructor(engine, agents) {
+    this.engine = engine;
+    this.agents = agents;
+  }
+
+  /** Shows the answer for the end of an episode; none for null. */
+  show(state) {
+    if (state === this.#shown) return;
+    this.#shown = state;
+    $("answer").hidden = !state;
+    if (!state) return;
+    const node = clueNode(state);
+    $("compared").replaceChildren(...(node ? [node] : []));
+    this.scores = [["You", scoreOf(state)]];
+    this.#write();
+    const files = this.agents.names(state.id);
+    if (files.length === 0) return;
+    this.#worker ??= this.#start();
+    const { id, options, seed } = state;
+    this.#worker.postMessage({ module: this.engine.module, files, episode: { id, options, seed: seed ?? "0" } });
+  }
+
+  #start() {
+    const worker = new Worker(new URL("score-worker.js", import.meta.url), { type: "module" });
+    worker.addEventListener("message", ({ data: { episode, name, state, isOver } }) => {
+      const shown = this.#shown;
+      if (!shown || ["id", "seed"].some((key) => shown[key] !== episode[key])) return;
+      this.scores.push([name, scoreOf(state) + (isOver ? "" : "+")]);
+      this.#write();
+    });
+    return worker;
+  }
+
+  #write() {
+    $("scores").replaceChildren(...this.scores.map(([name, score]) => {
+      const item = Object.assign(document.createElement("span"), { textContent: `${name} ` });
+      item.append(Object.assign(document.createElement("b"), { textContent: score }));
+      return item;
+    }));
+  }
+}
