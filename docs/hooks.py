@@ -115,7 +115,9 @@ def on_post_build(config: MkDocsConfig) -> None:
         text = (copy / "index.html").read_text()
         description = html.unescape(re.findall(r'name="description" content="([^"]*)"', text)[0])
         text = text.replace("</head>", preview("Endless Gym: play", description, config, "../") + "</head>", 1)
-        linked, count = re.subn(r"<footer\b[^>]*>", r'\g<0>\n    <p><a href="../index.html">Documentation</a></p>', text)
+        linked, count = re.subn(
+            r"<footer\b[^>]*>", r'\g<0>\n    <p><a href="../index.html">Documentation</a></p>', text
+        )
         if count != 1:
             raise PluginError("the page that plays has no footer for the link to the documentation")
         (copy / "index.html").write_text(linked)

@@ -10,9 +10,9 @@ export class Answer {
   #worker = null;
   #shown = null;
 
-  constructor(engine, agents) {
-    this.engine = engine;
-    this.agents = agents;
+  /** Calls `say` with the scores, for screen readers. */
+  constructor(engine, agents, say) {
+    Object.assign(this, { engine, agents, say });
   }
 
   /** Shows the answer for the end of an episode; none for null. */
@@ -44,6 +44,7 @@ export class Answer {
   }
 
   #write() {
+    if (this.scores.length > 1) this.say(`${this.scores.map((score) => score.join(" ")).join(", ")}.`);
     $("scores").replaceChildren(...this.scores.map(([name, score]) => {
       const item = Object.assign(document.createElement("span"), { textContent: `${name} ` });
       item.append(Object.assign(document.createElement("b"), { textContent: score }));

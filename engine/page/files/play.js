@@ -39,10 +39,10 @@ export class Play {
     this.isDemo = false;
     /** The reset parameters before an agent played with those of its training. */
     this.before = null;
-    this.agents = new Agents(engine);
-    this.answer = new Answer(engine, this.agents);
-    this.rival = new Rival(engine, this.agents);
     this.say = live($("status"));
+    this.agents = new Agents(engine);
+    this.answer = new Answer(engine, this.agents, (text) => this.say(text));
+    this.rival = new Rival(engine, this.agents);
     this.directions = new Directions(() => this.#takeOver());
     this.directions.attach($("pad"));
     this.controls = new ActionControls($("action"));
