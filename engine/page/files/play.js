@@ -285,8 +285,8 @@ export class Play {
     $("arrows").textContent = arrows;
     $("words").textContent = words;
     const running = this.pace.running;
-    $("pause").textContent = this.isDemo ? "Play" : running ? "Pause" : state.length === 0 ? "Start" : "Continue";
-    $("pause").disabled = $("step").disabled = this.#over() && !this.isDemo;
+    $("pause").textContent = this.isDemo ? "Play" : this.#over() ? "New episode" : running ? "Pause" : state.length === 0 ? "Start" : "Continue";
+    $("step").disabled = this.#over();
     document.body.classList.toggle("demo", this.isDemo);
     this.rival.follow(state, spec);
     this.answer.show(this.player === "person" && state.done ? state : null);
@@ -300,7 +300,7 @@ export class Play {
     $("said").textContent = text;
     $("choices").hidden = !this.#over() || this.isDemo;
     // On the picture then; their places stay, so that nothing moves.
-    for (const id of ["pause", "restart", "next"]) $(id).style.visibility = this.#over() && !this.isDemo ? "hidden" : "";
+    for (const id of ["restart", "next"]) $(id).style.visibility = this.#over() && !this.isDemo ? "hidden" : "";
   }
 
   #agent() {
@@ -365,7 +365,7 @@ export class Play {
   #listen() {
     const go = () => (this.isDemo ? this.#startOwn() : this.pace.running ? this.stop() : this.play());
     const tasks = { restart: () => this.restart(), next: () => this.otherSeed(1) };
-    $("pause").addEventListener("click", go);
+    $("pause").addEventListener("click", () => (this.#over() && !this.isDemo ? this.otherSeed(1) : go()));
     $("observation").parentElement.addEventListener("click", (event) => !event.target.closest("button") && go());
     for (const button of document.querySelectorAll("[data-do]")) button.addEventListener("click", tasks[button.dataset.do]);
     for (const player of ["person", "expert", "agent"]) $(player).addEventListener("click", () => this.choose(player));
