@@ -107,7 +107,7 @@ fn a_running_engine_is_shown_lost_and_found() {
     browser
         .wait("[...document.querySelectorAll('#curves path')].every((path) => path.getAttribute('d').includes('L'))");
     let values = browser.value("[...document.querySelectorAll('#curves b')].map((value) => value.textContent)");
-    assert!(values.as_array().unwrap().len() == 4 && !values.to_string().contains('–'), "{values}");
+    assert!(values.as_array().unwrap().len() == 5 && !values.to_string().contains('–'), "{values}");
     let numbers = browser.value("document.getElementById('numbers').textContent");
     assert!(numbers.as_str().unwrap().contains(ID), "{numbers}");
 
@@ -136,6 +136,55 @@ fn a_running_engine_is_shown_lost_and_found() {
     browser.value("globalThis.shown = endless.frames; 0");
     browser.wait("endless.frames > shown + 3");
     training.end();
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs Chromium"]
+fn the_address_keeps_the_engine_and_episodes_count_that_nobody_watched() {
+    let place = Place::new();
+    let _engine = place.serve(&["--env", "Endless-MortarMayhem-v0", "--num-envs", "4", "--seed", "1"]);
+    let mut trainer = place.trainer("endless").unwrap();
+    trainer.reset(0, ResetRequest::Seed(1)).unwrap();
+    let (mut returns, mut episodes) = (0.0, 0.0);
+    // Standing still ends each episode at a command.
+    while episodes < 4.0 {
+        let lease = trainer.receive(0, Duration::from_secs(60)).unwrap();
+        let batch = lease.batch();
+        for env in (0..4).filter(|env| batch.has_ended(*env)) {
+            (returns, episodes) = (returns + batch.episode_return()[env], episodes + 1.0);
+        }
+        drop(lease);
+        if episodes < 4.0 {
+            trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+        }
+    }
+    let server = Server::start(place.endless(&["view"]));
+    let mut browser = start("view-address");
+    browser.load(&server.url);
+    browser.wait("document.querySelector('#engines button')");
+    browser.click("#engines button");
+    browser.wait("endless.service === 'endless' && location.hash === '#engine=endless'");
+    // All episodes ended before the page was opened.
+    let mean = |what: &str| {
+        format!(
+            "[...document.querySelectorAll('#curves figure')].find((figure) => figure.innerText.startsWith('{what}')).querySelector('b').textContent"
+        )
+    };
+    browser.wait(&format!("{} !== '–'", mean("Mean return")));
+    assert_eq!(browser.value(&mean("Mean return")), format!("{:.3}", returns / episodes));
+    let connect = browser.value("document.getElementById('connect').textContent");
+    assert_eq!(connect, r#"A trainer connects with endless_gym.connect("endless")."#);
+    // The trainer goes on, and one environment is enlarged, with its ground truth.
+    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    trainer.receive(0, Duration::from_secs(60)).unwrap();
+    browser.wait(SHOWN);
+    browser.value("document.querySelectorAll('#grid button')[1].click()");
+    browser.wait("/, target_x [.0-9]+, target_y [.0-9]+$/.test(document.getElementById('caption').textContent)");
+    browser.call("Page.reload", &serde_json::json!({}));
+    browser.wait("globalThis.endless?.service === 'endless' && document.getElementById('live').checkVisibility()");
+    browser.value("history.back()");
+    browser.wait("endless.service === '' && document.getElementById('list').checkVisibility()");
     assert_eq!(browser.complaints, Vec::<String>::new());
 }
 
@@ -263,7 +312,7 @@ fn other_sites_and_addresses_without_the_token_are_refused() {
 #[ignore = "needs Chromium"]
 fn nothing_jumps_and_nothing_is_cut_off() {
     let place = Place::new();
-    let _engine = serve(&place);
+    let _engine = place.serve(&["--env", ID, "--num-envs", "20", "--groups", "2", "--seed", "1"]);
     let list = Server::start(place.endless(&["view"]));
     let server = Server::start(place.endless(&["view", "endless"]));
     let mut browser = start("view-layout");

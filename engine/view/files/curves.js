@@ -7,6 +7,7 @@ const CURVES = [
   ["episodes", "Episodes", grouped],
   ["mean_return", "Mean return", short],
   ["mean_length", "Mean length", (value) => short(value, 1)],
+  ["success_rate", "Success rate", (value) => `${Math.round(100 * value)} %`],
 ];
 const WIDTH = 300;
 const HEIGHT = 100;

@@ -26,18 +26,32 @@ class View {
     this.first = 0;
     this.large = null;
     this.curves = new Curves($("curves"));
-    this.table = new Table($("engines"), (service) => this.show(service));
+    this.table = new Table($("engines"), (service) => this.choose(service));
     this.#listen();
   }
 
   /** Shows the server's default engine, or the list. */
   async start() {
-    const { service } = await this.#list();
-    if (service) this.show(service);
+    this.given = (await engines()).service ?? "";
+    this.show(this.#named());
+    await this.#list();
+    addEventListener("popstate", () => this.show(this.#named()));
     // Listing costs more than reading one engine's status, so refresh only while the list is visible.
     setInterval(() => this.service === "" && !document.hidden && this.#list().catch(() => {}), 2000);
     // The times of a lost engine go on.
     setInterval(() => this.service && this.#numbers(), 1000);
+  }
+
+  /** The engine in the address, or the one that the server shows first; an empty name for the list. */
+  #named() {
+    return new URLSearchParams(location.hash.slice(1)).get("engine") ?? this.given;
+  }
+
+  /** Shows an engine, which stays in the address, so that Back and a reload lead to it. */
+  choose(service) {
+    // Not relative to the document's base.
+    history.pushState(null, "", `${location.pathname}${location.search}#${new URLSearchParams({ engine: service })}`);
+    this.show(service);
   }
 
   /** Shows an engine, or the list for an empty name. */
@@ -54,6 +68,7 @@ class View {
     // Its position depends on the content above it.
     document.querySelector("footer").hidden = false;
     $("engine").value = service;
+    $("connect").querySelector("code").textContent = `endless_gym.connect(${JSON.stringify(service)})`;
     document.title = service === "" ? "Endless Gym: view" : `${service} – Endless Gym`;
     if (service === "") this.#state("list", "engines");
     else this.#connect();
@@ -73,8 +88,6 @@ class View {
     $("none").hidden = answer.engines.length > 0;
     $("table").hidden = answer.engines.length === 0;
     $("root").textContent = answer.root;
-    if (this.service === null && !answer.service) this.show("");
-    return answer;
   }
 
   #connect() {
@@ -128,7 +141,7 @@ class View {
     $("rows").hidden = features.length === 0;
     if (features.length > 0) this.#rows(about.batch);
     if (frame) {
-      this.newest = { frame, envs, pixels };
+      this.newest = { frame, envs, pixels, names: about.batch.ground_truth };
       this.#paint(this.newest);
     } else $("nothing").textContent = "The engine has not drawn these environments yet.";
   }
@@ -173,7 +186,7 @@ class View {
     const groups = Array.from({ length: about.groups }, (_, group) => Object.assign(document.createElement("option"), { textContent: group }));
     $("group").replaceChildren(...groups);
     $("group").value = this.group;
-    $("group-label").hidden = about.groups === 1;
+    $("group").disabled = about.groups === 1;
     this.#select();
   }
 
@@ -193,7 +206,7 @@ class View {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ group: this.group, envs }));
   }
 
-  #paint({ frame, envs, pixels }) {
+  #paint({ frame, envs, pixels, names }) {
     const bytes = frameBytes(frame);
     const count = Number($("count").value);
     const shown = envs.filter(({ env }) => env >= this.first && env < this.first + count);
@@ -211,7 +224,8 @@ class View {
         paint(button.firstChild, frame, pixels, i * bytes);
       }
       if (each.env === this.large) {
-        $("caption").textContent = `Environment ${each.env}: step ${each.length}, reward ${short(each.reward, 2)}, return ${short(each.return, 2)}`;
+        const truth = names.map((name, i) => `, ${name} ${short(each.ground_truth?.[i], 2)}`).join("");
+        $("caption").textContent = `Environment ${each.env}: step ${each.length}, reward ${short(each.reward, 2)}, return ${short(each.return, 2)}${truth}`;
         paint($("enlarged"), frame, pixels, i * bytes);
       }
     });
@@ -252,7 +266,7 @@ class View {
     };
     document.addEventListener("visibilitychange", () => this.#select());
     $("engine").addEventListener("focus", () => this.#list().catch(() => {}));
-    $("engine").addEventListener("change", () => this.show($("engine").value));
+    $("engine").addEventListener("change", () => this.choose($("engine").value));
     $("group").addEventListener("change", () => move(() => (this.group = Number($("group").value))));
     $("count").addEventListener("change", () => move((count) => (this.first -= this.first % count)));
     $("before").addEventListener("click", () => move((count) => (this.first = Math.max(0, this.first - count))));

@@ -96,6 +96,7 @@ fn newest_frames<'a>(
 fn rows(specification: &ServiceSpecification, batch: &Batch<'_>, envs: &[usize]) -> Json {
     let features = specification.features.len();
     let names = if specification.frames.is_none() { &specification.features[..] } else { &[] };
+    let truths = specification.batch.section(BatchSection::GroundTruth).map_or(0, Section::width);
     let values: Vec<Json> = envs
         .iter()
         .map(|env| {
@@ -106,9 +107,12 @@ fn rows(specification: &ServiceSpecification, batch: &Batch<'_>, envs: &[usize])
                 "return": batch.episode_return().get(*env),
                 "length": batch.episode_length().get(*env),
                 "ended": batch.has_ended(*env),
+                "ground_truth": batch.ground_truth().get(env * truths..(env + 1) * truths),
                 "features": if names.is_empty() { &[] } else { row },
             })
         })
         .collect();
-    json!({"envs": values, "features": names})
+    let described = specification.environment["ground_truth"].as_array().into_iter().flatten();
+    let truths: Vec<&Json> = described.map(|column| &column["name"]).collect();
+    json!({"envs": values, "features": names, "ground_truth": truths})
 }

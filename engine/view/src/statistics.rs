@@ -25,9 +25,30 @@ pub(crate) struct Point {
     pub steps_per_second: f64,
     /// Episodes that have ended since the engine started.
     pub episodes: u64,
-    /// Means over the last observed episodes; `None` before the first.
+    /// Means over the last episodes, at least [`WINDOW`] if there are as many; `None` before the first.
     pub mean_return: Option<f64>,
     pub mean_length: Option<f64>,
+    pub success_rate: Option<f64>,
+}
+
+/// Sums over the episodes that have ended, at one time.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sums {
+    episodes: u64,
+    returns: f64,
+    lengths: u64,
+    successes: u64,
+}
+
+impl Sums {
+    fn of(status: &EngineStatus) -> Self {
+        Sums {
+            episodes: status.total(|group| group.episodes),
+            returns: status.groups.iter().map(|group| group.returns).sum(),
+            lengths: status.total(|group| group.lengths),
+            successes: status.total(|group| group.successes),
+        }
+    }
 }
 
 /// The returns and lengths of the last episodes that ended in the given batches.
@@ -88,7 +109,8 @@ pub(crate) struct History {
     dropped: u64,
     points: VecDeque<Point>,
     rate: RecentRate,
-    pub recent: RecentEpisodes,
+    /// The last sums before the episodes of the means, and those since.
+    sums: VecDeque<Sums>,
 }
 
 impl History {
@@ -101,23 +123,39 @@ impl History {
         self.rate = RecentRate::default();
     }
 
-    /// Adds a point. The first status gives none, since a rate needs two.
-    pub fn point(&mut self, status: &EngineStatus) {
+    /// Adds a point; `has_success` says whether episodes end with an info `success`. The first status gives none, since a rate needs two.
+    pub fn point(&mut self, status: &EngineStatus, has_success: bool) {
         let steps = status.total(|group| group.env_steps);
         let Some(steps_per_second) = self.rate.add(Instant::now(), steps) else { return };
-        let means = self.recent.means();
+        let sums = Sums::of(status);
+        let first = self.recent(sums);
+        let mean = |sum: f64| (sums.episodes > first.episodes).then(|| sum / (sums.episodes - first.episodes) as f64);
         let point = Point {
             seconds: status.uptime.as_secs_f64(),
             steps_per_second,
-            episodes: status.total(|group| group.episodes),
-            mean_return: means.map(|means| means.0),
-            mean_length: means.map(|means| means.1),
+            episodes: sums.episodes,
+            mean_return: mean(sums.returns - first.returns),
+            mean_length: mean(sums.lengths.saturating_sub(first.lengths) as f64),
+            success_rate: mean(sums.successes.saturating_sub(first.successes) as f64).filter(|_| has_success),
         };
         if self.points.len() == MAX_POINTS {
             self.points.pop_front();
             self.dropped += 1;
         }
         self.points.push_back(point);
+    }
+
+    /// Keeps the sums, and returns those before the last episodes.
+    fn recent(&mut self, sums: Sums) -> Sums {
+        if self.sums.back().is_none_or(|last| last.episodes < sums.episodes) {
+            self.sums.push_back(sums);
+        }
+        while self.sums.get(1).is_some_and(|next| next.episodes + WINDOW as u64 <= sums.episodes) {
+            self.sums.pop_front();
+        }
+        // All episodes of the engine, if there are few, or none was watched.
+        let is_recent = |first: &Sums| sums.episodes > WINDOW as u64 && first.episodes < sums.episodes;
+        self.sums.front().copied().filter(is_recent).unwrap_or_default()
     }
 
     /// The points from number `from` on, and the number after the last.
@@ -130,6 +168,18 @@ impl History {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn means_are_of_all_episodes_at_first_and_then_of_the_last_ones() {
+        let mut history = History::default();
+        let sums = |episodes: u64, returns: f64| Sums { episodes, returns, ..Sums::default() };
+        // All end in the same step, between two readings.
+        assert_eq!(history.recent(sums(0, 0.0)).episodes, 0);
+        assert_eq!(history.recent(sums(400, 100.0)).returns, 0.0);
+        assert_eq!(history.recent(sums(800, 150.0)).returns, 0.0);
+        assert_eq!(history.recent(sums(1400, 900.0)).returns, 100.0);
+        assert_eq!(history.recent(sums(1800, 1000.0)).returns, 150.0);
+    }
 
     #[test]
     fn rates_are_averaged_over_phases_without_steps_and_fall_to_zero_after_the_last() {

@@ -144,7 +144,7 @@ impl Observation {
                     group.want(is_shown);
                 }
             }
-            if self.take(channel)? {
+            if self.take()? {
                 (is_news, heard) = (true, Instant::now());
             }
             self.look(&viewers);
@@ -160,13 +160,10 @@ impl Observation {
     }
 
     /// Takes the newest batch of each group from which one is wanted. Returns whether there was any.
-    fn take(&mut self, channel: &Channel) -> Result<bool, ServiceError> {
+    fn take(&mut self) -> Result<bool, ServiceError> {
         let mut is_new = false;
         for group in &mut self.groups {
-            if let Some(batch) = group.take()? {
-                channel.history().recent.add(&batch);
-                is_new = true;
-            }
+            is_new |= group.take()?.is_some();
         }
         Ok(is_new)
     }
@@ -211,7 +208,8 @@ impl Observation {
         if status.incarnation != self.specification.incarnation {
             return;
         }
-        channel.history().point(&status);
+        let has_success = self.specification.info.iter().any(|name| name == "success");
+        channel.history().point(&status, has_success);
         if with_details {
             self.details = Details::of(&status, &channel.namespace);
         }

@@ -57,6 +57,12 @@ pub struct GroupStatus {
     pub env_steps: u64,
     /// Episodes that have ended.
     pub episodes: u64,
+    /// Sum of their returns.
+    pub returns: f64,
+    /// Sum of their lengths in steps.
+    pub lengths: u64,
+    /// How many of them ended with an info `success` of 1.
+    pub successes: u64,
     /// Requests that were rejected.
     pub rejected: u64,
     /// Batches that no process received.
@@ -179,6 +185,9 @@ impl GroupStatus {
             batches: group.batches,
             env_steps: group.env_steps,
             episodes: group.episodes,
+            returns: group.returns,
+            lengths: group.lengths,
+            successes: group.successes,
             rejected: group.rejected,
             undelivered: group.undelivered,
             trainers: group.trainers,

@@ -29,10 +29,38 @@ pub(crate) type ResponseLoan = SampleMut<Ipc, [PayloadBlock], ResponseHeader>;
 /// Why a request is rejected, and an explanation.
 pub(crate) type Rejected = (Rejection, String);
 
+/// The info that is 1 after a success.
+const SUCCESS: &str = "success";
+
 /// What the response to a request holds.
 pub(crate) enum Outcome {
-    Batch { env_steps: usize, episodes: usize },
+    Batch { env_steps: usize, ended: Ended },
     Snapshot { bytes: usize },
+}
+
+/// Episodes that ended in a step: their number, the sums of their returns and lengths, and how many succeeded.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Ended {
+    pub episodes: u64,
+    pub returns: f64,
+    pub lengths: u64,
+    pub successes: u64,
+}
+
+impl Ended {
+    /// `success` is the column of the infos that is 1 after a success.
+    fn of(batch: &Batch<'_>, success: Option<usize>) -> Self {
+        let mut ended = Ended::default();
+        let width = batch.info().len() / batch.terminated().len().max(1);
+        for env in (0..batch.terminated().len()).filter(|env| batch.has_ended(*env)) {
+            ended.episodes += 1;
+            ended.returns += batch.episode_return()[env];
+            ended.lengths += u64::try_from(batch.episode_length()[env]).unwrap_or_default();
+            let succeeded = success.and_then(|column| batch.info().get(env * width + column)) == Some(&1.0);
+            ended.successes += u64::from(succeeded);
+        }
+        ended
+    }
 }
 
 /// A batch that was sent and is still in memory.
@@ -239,14 +267,15 @@ impl Group {
             return Ok(Outcome::Snapshot { bytes: 0 });
         }
         self.trainer = Some(header.trainer);
-        let (env_steps, episodes) = match kind {
+        let (env_steps, ended) = match kind {
             RequestKind::Step => {
-                let terminated = Batch::new(self.pool.layout(), batch).terminated();
-                (terminated.len(), terminated.iter().map(|flag| usize::from(*flag)).sum())
+                let batch = Batch::new(self.pool.layout(), batch);
+                let success = self.pool.spec().info.iter().position(|column| column.name == SUCCESS);
+                (batch.terminated().len(), Ended::of(&batch, success))
             }
-            _ => (0, 0),
+            _ => (0, Ended::default()),
         };
-        Ok(Outcome::Batch { env_steps, episodes })
+        Ok(Outcome::Batch { env_steps, ended })
     }
 
     /// The states of the environments; `None` before the first reset.

@@ -94,10 +94,13 @@ impl StatusWriter {
                 Some(_) => record.executed = record.taken,
                 None => record.rejected += 1,
             }
-            if let Some(Outcome::Batch { env_steps, episodes }) = outcome {
+            if let Some(Outcome::Batch { env_steps, ended }) = outcome {
                 record.batches += 1;
                 record.env_steps += *env_steps as u64;
-                record.episodes += *episodes as u64;
+                record.episodes += ended.episodes;
+                record.returns += ended.returns;
+                record.lengths += ended.lengths;
+                record.successes += ended.successes;
             }
         });
     }

@@ -443,6 +443,10 @@ pub(crate) struct GroupRecord {
     /// Batches that the trainer held when it sent the last request.
     pub held: u32,
     pub padding: u32,
+    /// Sums over the episodes that have ended, and how many of them succeeded.
+    pub returns: f64,
+    pub lengths: u64,
+    pub successes: u64,
 }
 
 impl GroupRecord {
