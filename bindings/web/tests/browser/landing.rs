@@ -25,9 +25,9 @@ fn an_agent_plays_until_the_visitor_starts() {
         assert_eq!(text(&mut browser, "question"), "How many can you remember?");
         assert_eq!(text(&mut browser, "pause"), "Play");
         if start.starts_with('#') {
-            browser.click(start)
+            browser.click(start);
         } else {
-            browser.press(start)
+            browser.press(start);
         }
         browser.wait(&format!("!endless.play.isDemo && {STATE}.length > 0"));
         assert_eq!(browser.value("endless.play.player"), "person", "{start}");
