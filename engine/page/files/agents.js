@@ -1,10 +1,22 @@
 // The trained agents, and their results on the page.
 
 /** The files of the page's agents, without their ending: the id of the environment, with `-none` for an agent without memory. */
-const IDS = ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0"];
+const IDS = [
+  "Endless-MortarMayhem-v0-none",
+  "Endless-MortarMayhem-v0",
+  "MortarMayhem-Grid-v0",
+  "MysteryPath-Grid-v0",
+  "SearingSpotlights-v0",
+];
 
 /** Minutes of their training on one core. */
-const MINUTES = { "MortarMayhem-Grid-v0": 12, "MysteryPath-Grid-v0": 17, "SearingSpotlights-v0": 9 };
+const MINUTES = {
+  "Endless-MortarMayhem-v0": 31,
+  "Endless-MortarMayhem-v0-none": 3,
+  "MortarMayhem-Grid-v0": 12,
+  "MysteryPath-Grid-v0": 17,
+  "SearingSpotlights-v0": 9,
+};
 
 /** The environments with an agent that has a memory. */
 const PLAYED = IDS.filter((name) => !name.endsWith("-none"));
