@@ -3,7 +3,7 @@
     python preset.py runs        # the same command again resumes what was interrupted
 
 Networks and batches are an eighth as large as on a GPU, so that their ratio is the same: a GRU of 64 units, 128 environments with
-rollouts of 128 steps, and 4 environments with 512 for `paper`. All runs have 2,097,152 steps from feature observations. The trainer is
+rollouts of 128 steps, and 4 environments with 512 for `paper`. All runs have 2,097,152 steps from feature observations, by
 `endless learn`. `gpu/preset.json` has each run's mean reward, over the whole run and over the last tenth of its updates.
 """
 

@@ -466,8 +466,8 @@ def _presets() -> dict[str, Settings]:
     )
     # As far as the first point of the published curves, which is therefore what to expect.
     overnight = _replace(dataclasses.replace(paper, preset="overnight"), ppo={"updates": 500})
-    # Eight times the environment steps per update of `paper`. Of five choices, this one learnt most per step on the CPU, more than
-    # `paper` with the same ratios of batch to network (agents/benches/gpu/preset.py).
+    # Eight times the environment steps per update of `paper`. Of five choices, this one learnt most per step on the CPU, and more
+    # than `paper` with the same ratios of batch to network (agents/benches/preset.py).
     gpu = _replace(
         dataclasses.replace(paper, preset="gpu", bf16=True),
         environment={"num_envs": 1024},
