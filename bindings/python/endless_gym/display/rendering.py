@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from endless_gym import _native
 from endless_gym.specs import Spec, json_text, spec
 
-#: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3), which shows
-#: the same in environments without frames; or the text of what the agent sees, in environments without frames.
+#: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3), which
+#: shows the same in environments without frames; or the text of what the agent sees, in environments without frames.
 View = Literal["agent", "ground_truth", "text"]
 
 #: The render modes of a single environment, with the views that each can show; the first is the original's.
