@@ -120,7 +120,8 @@ def play(
         active = np.ones(num_envs, dtype=np.bool_)
         start = np.ones(num_envs, dtype=np.bool_)
         limits = np.array([np.inf if plan.max_steps is None else plan.max_steps for plan in plans])
-        truths, actions, rewards = [_copied(info)], [], []
+        truths, rewards = [_copied(info)], []
+        actions: list[NDArray[Any]] = []
         episodes: list[Episode | None] = [None] * num_envs
         for path, part in recorded():
             growing[path].append(part, active)
