@@ -93,7 +93,7 @@ def test_engines_whose_names_begin_alike_are_told_apart(parent: Path) -> None:
     [("RLIMIT_NOFILE", 12, "ulimit -n"), ("RLIMIT_FSIZE", 0, "ulimit -f"), ("RLIMIT_AS", 0, "ulimit -v")],
 )
 def test_an_engine_survives_an_observer_that_cannot_attach(limit: str, value: int, option: str, parent: Path) -> None:
-    """The limit of the address space leaves the observer a megabyte."""
+    """The limit of the address space leaves the observer a megabyte, and a batch has more than two."""
     text = f"""
 import resource, sys, endless_gym
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
@@ -102,9 +102,9 @@ resource.setrlimit(resource.{limit}, (value, value))
 with endless_gym.watch("gym", timeout=5) as batches:
     next(batches)
 """
-    actions = np.zeros(2, dtype=np.int64)
+    actions = np.zeros(128, dtype=np.int64)
     with (
-        engine_of_program("gym", ID, "--num-envs=2"),
+        engine_of_program("gym", ID, "--num-envs=128"),
         contextlib.closing(endless_gym.connect("gym", timeout=30)) as envs,
     ):
         envs.reset(seed=1)
