@@ -1,8 +1,8 @@
 """Who can use the files of engines, which directories and names are refused, and what limits of resources do."""
 
 import contextlib
-import re
 import os
+import re
 import shlex
 import subprocess
 import sys
