@@ -31,9 +31,8 @@ pub fn build(write: bool) -> Result<(), String> {
     }
     output(&mut mkdocs)?;
     run(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;
-    let mut copy = Command::new("cp");
-    copy.args(["--recursive", "--no-target-directory"]).arg(target()?.join("doc")).arg(site.join("rust"));
-    run(&mut copy)?;
+    let copy = ["--recursive", "--no-target-directory"];
+    run(Command::new("cp").args(copy).arg(target()?.join("doc")).arg(site.join("rust")))?;
     println!("{}", site.join("index.html").display());
     Ok(())
 }

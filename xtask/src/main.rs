@@ -19,8 +19,7 @@ use clap::Parser;
 enum Task {
     /// Check formatting, run lints, and run the tests that need only Rust, a linker and CPython.
     Test {
-        /// Run the remaining steps instead: those that take long, or need further tools, third-party libraries or the
-        /// original.
+        /// Run the remaining steps instead: those that take long, or need further tools, third-party libraries or the original.
         #[arg(long)]
         all: bool,
         /// Run only these steps.
@@ -77,14 +76,11 @@ enum Task {
         #[arg(long, default_value_t = 1)]
         minutes: u64,
     },
-    /// Set up an original in a virtual environment and print the path of its Python.
+    /// Set up the originals, each in a virtual environment, and print the paths of their Pythons, separated by a comma.
     Original {
-        /// POPGym, in place of Memory Gym.
-        #[arg(long)]
-        popgym: bool,
-        /// Both, each in an environment of its own, separated by a comma, as for `endless bench --env all --original`.
-        #[arg(long, conflicts_with = "popgym")]
-        all: bool,
+        /// Only this one: memory-gym or popgym.
+        #[arg(value_parser = ["memory-gym", "popgym"])]
+        only: Option<String>,
     },
 }
 
@@ -110,9 +106,10 @@ fn main() -> ExitCode {
         Task::Soak(Arguments { arguments }) => rust::faults("soak", &arguments),
         Task::Live { steps } => rust::test_original(Some(steps)),
         Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), minutes),
-        Task::Original { popgym, all } => {
-            let suites = [false, true].into_iter().filter(|suite| all || *suite == popgym);
-            let paths = suites.map(|suite| Ok(python::original(suite)?.display().to_string()));
+        Task::Original { only } => {
+            let names =
+                ["memory-gym", "popgym"].into_iter().filter(|name| only.as_ref().is_none_or(|only| only == name));
+            let paths = names.map(|name| Ok(python::original(name == "popgym")?.display().to_string()));
             paths.collect::<Result<Vec<_>, _>>().map(|paths| println!("{}", paths.join(",")))
         }
     };

@@ -95,8 +95,7 @@ fn source_distribution(tools: &Path, folder: &Path) -> Result<PathBuf, String> {
     run(maturin(tools, "sdist").arg("--manifest-path").arg(manifest).arg("--out").arg(folder))?;
     let unpacked = target()?.join("dist-source");
     recreate(&unpacked)?;
-    // The files in the archive have a fixed time. `--touch` sets the current time, so that cargo sees that they
-    // changed.
+    // The files in the archive have a fixed time. `--touch` sets the current time, so that cargo sees that they changed.
     let mut tar = Command::new("tar");
     tar.args(["--extract", "--touch", "--strip-components=1", "--file"]).arg(only_file(folder, &source_archive())?);
     run(tar.arg("--directory").arg(&unpacked))?;
@@ -194,8 +193,7 @@ pub fn test() -> Result<(), String> {
     install_and_use(&oldest, "source", &only_file(&folder()?, &source_archive())?, "no page")
 }
 
-/// Installs a package with the locked versions of its dependencies, and nothing else, into a virtual environment, and
-/// tests it.
+/// Installs a package with the locked versions of its dependencies, and nothing else, into a virtual environment, and tests it.
 fn install_and_use(python: &Path, name: &str, package: &Path, page: &str) -> Result<(), String> {
     let folder = target()?.join("packages").join(name);
     recreate(&folder)?;

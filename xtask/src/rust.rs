@@ -41,11 +41,9 @@ pub fn test() -> Result<(), String> {
 /// The ignored tests (slow ones, and those that the machine may forbid), except those that need a browser or the
 /// original, or only measure.
 pub fn test_ignored() -> Result<(), String> {
-    let mut arguments: Vec<&str> =
-        "test --workspace --locked --no-fail-fast --lib --tests --exclude endless-gym-web -- \
-        --ignored --skip browser:: --skip live:: --skip measure"
-            .split(' ')
-            .collect();
+    let all = "test --workspace --locked --no-fail-fast --lib --tests --exclude endless-gym-web -- --ignored";
+    let mut arguments = Vec::from_iter(all.split(' '));
+    arguments.extend("--skip browser:: --skip live:: --skip measure".split(' '));
     if !succeeds(Command::new("unshare").args(["--mount", "--map-root-user", "true"])) {
         not_run("without permission to create mount namespaces: tests in shared memory of other sizes")?;
         let skipped = ["inside_", "two_directories_of_one_path", "too_little_shared_memory"];
@@ -72,9 +70,8 @@ pub fn test_original(steps: Option<u64>) -> Result<(), String> {
         Some(steps) => cargo.arg("--release").env("ENDLESS_LIVE_STEPS", steps.to_string()),
         None => cargo.env("PROPTEST_RNG_SEED", PROPERTY_SEED),
     };
-    cargo
-        .env("ENDLESS_POPGYM_PYTHON", python::original(true)?)
-        .env("ENDLESS_ORIGINAL_PYTHON", python::original(false)?);
+    let (popgym, original) = (python::original(true)?, python::original(false)?);
+    cargo.env("ENDLESS_POPGYM_PYTHON", popgym).env("ENDLESS_ORIGINAL_PYTHON", original);
     run(cargo.args(["--", "--ignored", "--nocapture", "live::"]))
 }
 
@@ -92,8 +89,7 @@ pub fn fuzz(only: Option<&str>, minutes: u64) -> Result<(), String> {
     }
 }
 
-/// Checks the models of the worker threads under loom, in a separate target directory, since the flags apply to all
-/// crates.
+/// Checks the models of the worker threads under loom, in a separate target directory, since the flags apply to all crates.
 pub fn loom() -> Result<(), String> {
     let mut cargo =
         shell::cargo(&["test", "--locked", "--package", "endless-gym-core", "--lib", "loom_", "--target-dir"]);
@@ -147,8 +143,7 @@ pub fn instructions(record: bool) -> Result<(), String> {
 /// Instructions of all counted steps of an environment, measured by callgrind.
 fn count(id: &str) -> Result<u64, String> {
     const VALGRIND: &str = "valgrind --tool=callgrind --callgrind-out-file=/dev/null --log-fd=1 --toggle-collect=instructions::counted_steps";
-    // Keep the C library from using `rep movsb` and `rep stosb`, since callgrind counts each of their bytes as an
-    // instruction.
+    // Keep the C library from using `rep movsb` and `rep stosb`, since callgrind counts each of their bytes as an instruction.
     const TUNABLES: &str = "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000";
     let runner = format!("target.'cfg(all())'.runner=\"{VALGRIND}\"");
     let mut bench = shell::cargo(&["bench", "--locked", "--config", &runner, "--package", "endless-gym-memory-gym"]);

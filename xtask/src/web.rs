@@ -17,19 +17,14 @@ const TARGET: &str = "wasm32-unknown-unknown";
 pub const MISSING: &str = "Rust's standard library for wasm32-unknown-unknown; rustup target add wasm32-unknown-unknown, or on Debian \
     .ci/wasm-toolchain, which unpacks Debian's compiler under target/";
 
-/// Limit of the total bytes of the files, each compressed, that a browser downloads at first: all but the agents that the landing does not
-/// show.
+/// Limit of the bytes of all compressed files that a browser downloads at first, without agents that the landing does not show.
 const LIMIT: u64 = 620_000;
-
-/// The environment of the landing.
-const LANDING: &str = "Endless-MortarMayhem-v0";
 
 /// A compiler with the target's standard library, or with its sources.
 pub enum Toolchain {
     /// The compiler on the path.
     Own,
-    /// Debian's compiler in the folder where `.ci/wasm-toolchain` unpacks it. Debian has no compiled standard library
-    /// for it.
+    /// Debian's compiler in the folder where `.ci/wasm-toolchain` unpacks it. Debian has no compiled standard library for it.
     Debian(PathBuf),
 }
 
@@ -43,8 +38,7 @@ impl Toolchain {
         folder.join("bin/rustc").exists().then_some(Toolchain::Debian(folder))
     }
 
-    /// Sets the variables with which cargo, or a command that runs it, builds with this compiler, and returns the target
-    /// directory.
+    /// Sets the variables with which cargo, or a command that runs it, builds with this compiler, and returns the target directory.
     fn set(&self, command: &mut Command) -> Result<PathBuf, String> {
         let mut built = target()?;
         if let Toolchain::Debian(folder) = self {
@@ -100,7 +94,7 @@ pub fn build() -> Result<(), String> {
     }
     let compress = |bytes: &[u8]| io::copy(&mut GzEncoder::new(bytes, Compression::default()), &mut io::sink());
     // Reading from memory does not fail.
-    let is_first = |name: &str| !name.ends_with(".safetensors") || name.starts_with(LANDING);
+    let is_first = |name: &str| !name.ends_with(".safetensors") || name.starts_with("Endless-MortarMayhem-v0");
     let first: Vec<_> = files.iter().filter(|(name, _)| is_first(name)).collect();
     let compressed: u64 = first.iter().flat_map(|(_, bytes)| compress(bytes)).sum();
     println!("    {} files, {compressed} bytes compressed, {}", first.len(), folder()?.join("index.html").display());
