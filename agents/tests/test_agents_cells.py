@@ -1,6 +1,5 @@
 """What the agents' programs offer, for every kind of environment: programs down, environments across."""
 
-import re
 import sys
 from pathlib import Path
 
@@ -46,10 +45,7 @@ def test_a_run_in_an_environment_of_integers_resumes_and_is_shown(
     run = train(parse(f"--env popgym-AutoencodeEasy-v0 --preset quick {small} --run {tmp_path / 'run'}".split()))
     train(parse(f"--resume {run} --ppo.updates 3".split()))
     assert checkpoint.load(run).update == 3
-    monkeypatch.setattr(sys, "argv", ["endless-enjoy", str(run), "--max-steps", "3"])
+    film = tmp_path / "film.webp"
+    monkeypatch.setattr(sys, "argv", ["endless-enjoy", str(run), "--max-steps", "3", "--out", str(film)])
     assert enjoy.main() == 0
-    lines = capsys.readouterr().out.splitlines()[-8:]
-    assert lines[0].endswith("seed 200000  step 0") and re.fullmatch(
-        r"    mode 1  suit (spades|diamonds|clubs|hearts)", lines[1]
-    )
-    assert lines[6].split("  ")[2] == "step 3"
+    assert "in 3 steps" in capsys.readouterr().out and film.read_bytes()[8:12] == b"WEBP"

@@ -37,15 +37,19 @@ def trained(tmp_path: Path, **changes: Any) -> Path:
 def test_the_committed_file_computes_the_committed_vectors(file: Path) -> None:
     committed = json.loads((ROOT / "bindings" / "web" / "tests" / "agents" / f"{file.stem}.json").read_text())
     loaded = checkpoint.load(file)
-    assert committed["env"] == file.stem
+    assert committed["env"] == file.stem.removesuffix("-none")
     recorded = export.record_vectors(loaded.agent, len(committed["features"]))
     for exact in ("reset", "features", "action"):
         assert recorded[exact] == committed[exact]
     # Logits have sizes around 10.
     np.testing.assert_allclose(recorded["logits"], committed["logits"], rtol=1e-5, atol=1e-4)
     assert sum(recorded["reset"]) >= 2
-    # Visitors of the page should see it succeed.
-    assert header(file)["evaluation"][0]["success"] > 0.9
+    # Visitors of the page should see it succeed, unless it has no memory.
+    evaluation = header(file)["evaluation"][0]
+    if file.stem.startswith("Endless"):
+        assert (evaluation["mean_reward"] > 0.4) != file.stem.endswith("-none")
+    else:
+        assert evaluation["success"] > 0.9
 
 
 def header(file: Path) -> dict[str, Any]:

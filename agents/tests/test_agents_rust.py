@@ -200,7 +200,7 @@ def test_a_run_in_an_environment_of_integers_is_recorded_and_exported(
     printed = capsys.readouterr().out
     assert "\n3 episodes, " in f"\n{printed}" and "the page does not" in printed
     exported, trained = checkpoint.load(out), checkpoint.load(run)
-    assert exported.settings.environment.wrapper == trained.settings.environment.wrapper == (ONE_HOT,)
+    assert exported.settings.environment.wrapper == trained.settings.environment.wrapper == (VECTORS,)
     results = [evaluate(each.agent, range(200_000, 200_003), 1, greedy=True) for each in (exported, trained)]
     assert [result["length"] for result in results[0]] == [result["length"] for result in results[1]]
 

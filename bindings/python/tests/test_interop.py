@@ -235,7 +235,9 @@ def test_environments_in_this_process_write_to_memory_of_torch(monkeypatch: pyte
 
 
 def test_unfit_memory_is_refused() -> None:
-    (config,) = checked_arguments(ENDLESS, 2, 1, 1, 1, None, None, "same_step", "rgb", None, False, False, 0, None).pools
+    (config,) = checked_arguments(
+        ENDLESS, 2, 1, 1, 1, None, None, "same_step", "rgb", None, False, False, 0, None
+    ).pools
     unfit = {
         ValueError: [
             lambda size: torch.zeros(size - 1, dtype=torch.uint8),

@@ -36,6 +36,8 @@ fn largest_difference(found: &[f32], expected: &[f32]) -> f32 {
 fn the_networks_compute_what_pytorch_computes() {
     let (of_the_page, of_tests) = ("../../engine/page/files", "tests/agents");
     for (folder, name) in [
+        (of_the_page, "Endless-MortarMayhem-v0-none"),
+        (of_the_page, "Endless-MortarMayhem-v0"),
         (of_the_page, "MortarMayhem-Grid-v0"),
         (of_the_page, "MysteryPath-Grid-v0"),
         (of_the_page, "SearingSpotlights-v0"),
