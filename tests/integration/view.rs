@@ -15,6 +15,7 @@ use crate::support::recorded::pixel_formats;
 use crate::support::service::{reset, step};
 use endless_gym::batch::Frames;
 use endless_gym::pool::{PoolConfig, ResetRequest};
+use endless_gym::popgym;
 use endless_gym::service::{EngineStatus, Trainer};
 use serde_json::json;
 
@@ -139,8 +140,14 @@ fn a_page_shows_pictures_and_numbers_of_environments_without_frames() {
     socket.wait(|about| about["state"] == "live");
     trainer.reset(1, ResetRequest::Seed(3)).unwrap();
     let lease = trainer.receive(1, TIMEOUT).unwrap();
-    let (about, _) = socket.wait(|about| about["batch"]["group"] == 1);
-    assert!(about["has_frames"] == true);
+    let (about, pixels) = socket.wait(|about| about["batch"]["group"] == 1 && about["batch"]["frame"].is_object());
+    assert!(about["has_frames"] == true && pixels.len() == 84 * 84 * 3);
+    // The picture of the same card in other environments.
+    let mut twin = Player::in_registry(popgym(), &PoolConfig::new("popgym-RepeatFirstEasy-v0", 30), 1);
+    twin.reset(ResetRequest::Seed(3));
+    let card = lease.batch().features()[2];
+    let env = twin.batch().features().iter().position(|other| *other == card).unwrap();
+    assert!(pixels == twin.pool.frame(env).unwrap());
     let features = trainer.specification().features.clone();
     assert_eq!(about["batch"]["features"], json!(features));
     assert_eq!(about["batch"]["envs"].as_array().unwrap().len(), 1, "there are three environments");

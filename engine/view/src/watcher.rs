@@ -225,7 +225,7 @@ impl Observation {
                     "id": self.specification.id,
                     "groups": self.specification.groups,
                     "num_envs": self.specification.num_envs,
-                    "has_frames": (["frame", "picture"].iter().any(|name| self.specification.environment[name].is_object())),
+                    "has_frames": self.specification.shown().is_some(),
                     "status": self.status,
                 });
                 let lease = self.groups.get(selection.group).and_then(WatchedGroup::newest);

@@ -4,7 +4,6 @@ use std::fs;
 use std::path::PathBuf;
 
 use endless_gym_core::raster::FrameShape;
-use serde::Deserialize;
 
 use crate::client::observer::Observer;
 use crate::error::ServiceError;
@@ -59,7 +58,7 @@ pub struct Drawn {
 
 impl Pictures {
     /// Asks the engine of an observer, so far for no environments. `None` if its batches have frames, or its environments have
-    /// none.
+    /// neither frames nor pictures.
     ///
     /// # Errors
     ///
@@ -67,9 +66,7 @@ impl Pictures {
     /// created in `/dev/shm`.
     pub fn of(observer: &Observer) -> Result<Option<Self>, ServiceError> {
         let (specification, node) = (observer.specification(), observer.node());
-        let shape = |name| FrameShape::deserialize(&specification.environment[name]).ok();
-        let shape = shape("frame").or(shape("picture"));
-        let Some(shape) = shape.filter(|_| specification.frames.is_none()) else { return Ok(None) };
+        let Some(shape) = specification.shown().filter(|_| specification.frames.is_none()) else { return Ok(None) };
         // Under the creation lock, since another process would remove the file while it is empty.
         let _creating = node.creating()?;
         let (file, path) = PictureFile::create(node.prefix(), specification.incarnation, rand::random())

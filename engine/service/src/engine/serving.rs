@@ -253,7 +253,7 @@ impl Engine {
         Self::check_published(&node, &specification)?;
         let (service, process) = (&*specification.service, specification.engine_pid);
         tracing::info!(service, process, id = &*specification.id, groups = specification.groups, "engine started");
-        let draws = specification.frames.is_none() && !specification.environment["frame"].is_null();
+        let draws = specification.frames.is_none() && specification.shown().is_some();
         let pictures = draws.then(|| Mutex::new(PictureDrawer::new(node.prefix(), specification.incarnation)));
         let groups = Groups::new(groups, waker);
         Ok(Engine { groups, to_trainer, to_engine, servers, specification, status, checkpointer, pictures, node })

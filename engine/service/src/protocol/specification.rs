@@ -66,6 +66,13 @@ pub struct ServiceSpecification {
 }
 
 impl ServiceSpecification {
+    /// Size of what people see of an environment: its frame, or the picture of one without frames. As [`EnvSpec::shown`].
+    ///
+    /// [`EnvSpec::shown`]: endless_gym_core::envs::EnvSpec::shown
+    pub fn shown(&self) -> Option<FrameShape> {
+        ["frame", "picture"].into_iter().find_map(|name| FrameShape::deserialize(&self.environment[name]).ok())
+    }
+
     pub(crate) fn lease_limits(&self) -> LeaseLimits {
         LeaseLimits { batches_held: self.batches_held, observers: self.observers }
     }
