@@ -120,12 +120,12 @@ impl ObservationSpace {
 
     /// Whether features are in the space.
     pub fn contains(&self, features: &[f32]) -> bool {
-        let is_choice =
-            |(number, choices): (&f32, &i32)| number.fract() == 0.0 && (0.0..*choices as f32).contains(number);
         features.len() == self.width()
             && match self {
-                ObservationSpace::Discrete(choices) => is_choice((&features[0], choices)),
-                ObservationSpace::MultiDiscrete(choices) => features.iter().zip(*choices).all(is_choice),
+                ObservationSpace::Discrete(choices) => is_choice(features[0], *choices),
+                ObservationSpace::MultiDiscrete(choices) => {
+                    features.iter().zip(*choices).all(|(number, choices)| is_choice(*number, *choices))
+                }
                 ObservationSpace::Box { low, high } => features
                     .iter()
                     .zip(low.iter().zip(*high))
@@ -140,6 +140,11 @@ impl ObservationSpace {
                 }
             }
     }
+}
+
+/// Whether a number is one of the integers from 0 to less than `choices`.
+fn is_choice(number: f32, choices: i32) -> bool {
+    number.fract() == 0.0 && (0.0..choices as f32).contains(&number)
 }
 
 impl fmt::Display for ObservationSpace {
@@ -201,11 +206,10 @@ impl StatePart {
 
     /// Whether numbers are in its space.
     pub fn contains(&self, numbers: &[f32]) -> bool {
-        let is_choice = |number: &f32, choices: i32| number.fract() == 0.0 && (0.0..choices as f32).contains(number);
         numbers.len() == self.width()
             && match self.space {
-                StateSpace::Integers(choices) => numbers.iter().all(|number| is_choice(number, choices)),
-                StateSpace::Binary => numbers.iter().all(|number| is_choice(number, 2)),
+                StateSpace::Integers(choices) => numbers.iter().all(|number| is_choice(*number, choices)),
+                StateSpace::Binary => numbers.iter().all(|number| is_choice(*number, 2)),
                 StateSpace::Box { low, high } => numbers
                     .iter()
                     .zip(low.iter().cycle().zip(high.iter().cycle()))
