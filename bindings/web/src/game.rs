@@ -213,7 +213,10 @@ impl Game {
     fn draw(&mut self) -> Result<(), WebError> {
         let Some(shape) = self.pool.spec().shown() else { return Ok(()) };
         put_view(&self.pool.ground_truth_view(0)?, shape, &mut self.view);
-        put_observation(&self.pool.frame(0)?, shape, &mut self.observation, shape.width);
+        let drawn = if self.pool.spec().frame.is_none() { self.pool.frame(0)? } else { Vec::new() };
+        let batch = Batch::new(self.pool.layout(), &self.blocks);
+        let picture = if drawn.is_empty() { batch.observation() } else { &drawn };
+        put_observation(picture, shape, &mut self.observation, shape.width);
         Ok(())
     }
 

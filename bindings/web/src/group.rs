@@ -75,7 +75,6 @@ impl Group {
             Policy::Experts(experts) => experts.act(&batch, &mut self.actions)?,
         }
         self.pool.step(&self.actions, &mut self.blocks)?;
-        self.draw()?;
         let batch = Batch::new(self.pool.layout(), &self.blocks);
         for env in (0..batch.layout().num_envs()).filter(|env| batch.has_ended(*env)) {
             self.episodes += 1;
@@ -86,7 +85,7 @@ impl Group {
     }
 
     /// Draws the pictures of environments without frames.
-    fn draw(&mut self) -> Result<(), WebError> {
+    pub fn draw(&mut self) -> Result<(), WebError> {
         self.drawn.clear();
         if self.pool.spec().frame.is_none() {
             for env in 0..self.pool.layout().num_envs() {

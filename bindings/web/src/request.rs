@@ -177,6 +177,7 @@ pub fn step_wall(app: &mut App, count: u32) -> Result<Reply, WebError> {
 /// An entry of the table, with the engine's own texts for limits and defaults.
 fn spec(registry: &Registry, spec: &EnvSpec) -> Json {
     let mut value = json!(spec);
+    value["shown"] = json!(spec.shown());
     value["action_branches"] = json!(spec.action_space.branches());
     value["has_expert"] = registry.expert(spec.id).is_ok().into();
     for (parameter, json) in spec.parameters.iter().zip(value["parameters"].as_array_mut().into_iter().flatten()) {

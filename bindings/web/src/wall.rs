@@ -43,7 +43,8 @@ impl Wall {
     }
 
     pub fn step(&mut self, count: u32) -> Result<(), WebError> {
-        (0..count).try_for_each(|_| self.groups.iter_mut().try_for_each(Group::step))
+        (0..count).try_for_each(|_| self.groups.iter_mut().try_for_each(Group::step))?;
+        self.groups.iter_mut().try_for_each(Group::draw)
     }
 
     /// The episode that the environment at a place of the picture plays.

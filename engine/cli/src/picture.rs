@@ -62,9 +62,13 @@ pub fn picture(registry: &Registry, spec: &EnvSpec, columns: u16) -> Result<Stri
         film.step()?;
     }
     let reduced = |picture: &Picture| Pixels::from(picture).resized(SIDE);
-    let mut pictures = vec![("ground truth", reduced(&film.ground_truth_view()?))];
-    if usize::from(columns) >= 2 * SIDE + GAP {
-        pictures.insert(0, ("observation", reduced(&film.observation()?)));
+    // Without frames, both are the same picture.
+    let mut pictures = Vec::new();
+    if spec.frame.is_none() || usize::from(columns) >= 2 * SIDE + GAP {
+        pictures.push(("observation", reduced(&film.observation()?)));
+    }
+    if spec.frame.is_some() {
+        pictures.push(("ground truth", reduced(&film.ground_truth_view()?)));
     }
     Ok(half_blocks(&pictures))
 }

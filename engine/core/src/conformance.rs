@@ -274,7 +274,7 @@ fn snapshots_continue(registry: &Registry, spec: &EnvSpec) -> Result<(), String>
 }
 
 fn repaints(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
-    let Some(frame) = spec.frame else { return Ok(()) };
+    let Some(frame) = spec.frame else { return pictures(registry, spec) };
     for (bits, stack) in [(0, 1), (1, 1), (2, 3), (4, 2)] {
         let format = PixelFormat {
             grayscale: bits == 4 && frame.channels == 3,
@@ -284,6 +284,20 @@ fn repaints(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
         let frames = Some(Frames { format, stack });
         let config = config(spec, NUM_ENVS).frames(frames).check_drawing(true);
         Game::started(registry, &config, 13)?.play(STEPS)?;
+    }
+    Ok(())
+}
+
+/// Draws the pictures of an environment without frames.
+fn pictures(registry: &Registry, spec: &EnvSpec) -> Result<(), String> {
+    if spec.picture.is_none() {
+        return Ok(());
+    }
+    let mut game = Game::started(registry, &config(spec, NUM_ENVS), 13)?;
+    for _ in 0..STEPS {
+        game.pool.frame(0).map_err(text)?;
+        let actions = game.actions(NUM_ENVS);
+        game.step(&actions)?;
     }
     Ok(())
 }

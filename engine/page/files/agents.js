@@ -11,7 +11,7 @@ const IDS = [
 
 /** Minutes of their training on one core. */
 const MINUTES = {
-  "Endless-MortarMayhem-v0": 31,
+  "Endless-MortarMayhem-v0": 32,
   "Endless-MortarMayhem-v0-none": 3,
   "MortarMayhem-Grid-v0": 12,
   "MysteryPath-Grid-v0": 17,

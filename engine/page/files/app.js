@@ -52,7 +52,7 @@ class App {
       report: (error) => this.#noWall(error),
     });
     this.#environments();
-    $("to-wall").disabled = this.specs.every((spec) => !spec.frame && !spec.picture);
+    $("to-wall").disabled = this.specs.every((spec) => !spec.shown);
     $("agent").hidden = this.specs.every((spec) => !this.play.agents.has(spec.id));
     this.#listen();
   }

@@ -176,7 +176,7 @@ export class Play {
       this.#legend();
       this.#pad();
       this.controls.show(this.spec);
-      this.#frame(this.spec.frame ?? this.spec.picture);
+      this.#frame(this.spec.shown);
       this.#originalPace();
     }
     this.changed(state);
@@ -266,10 +266,9 @@ export class Play {
   #show() {
     const { state, spec } = this;
     if (!state) return;
-    const shape = spec.frame ?? spec.picture;
-    if (shape) {
-      $("observation").getContext("2d").putImageData(this.engine.observation(shape), 0, 0);
-      $("view").getContext("2d").putImageData(this.engine.view(shape), 0, 0);
+    if (spec.shown) {
+      $("observation").getContext("2d").putImageData(this.engine.observation(spec.shown), 0, 0);
+      $("view").getContext("2d").putImageData(this.engine.view(spec.shown), 0, 0);
     } else {
       showNumbers($("features"), spec.features.map(({ name }, index) => ({ name, value: state.features[index] })));
     }

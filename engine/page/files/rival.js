@@ -31,13 +31,13 @@ export class Rival {
   }
 
   /** Plays to the step of the other agent, and shows both scores. */
-  follow(other, { frame }) {
+  follow(other, { shown }) {
     if (!this.#state || !this.#wanted) return;
     const most = other.length - this.#state.length;
     if (most > 0 && !this.#state.done) this.#state = this.engine.request({ steps_of_agent: { most } });
     const canvas = $("rival-picture");
-    if (canvas.width !== frame.width) Object.assign(canvas, frame);
-    canvas.getContext("2d").putImageData(this.engine.observation(frame), 0, 0);
+    if (canvas.width !== shown.width) Object.assign(canvas, { width: shown.width, height: shown.height });
+    canvas.getContext("2d").putImageData(this.engine.observation(shown), 0, 0);
     $("rival").classList.toggle("over", this.#state.done);
     $("rival-score").textContent = scoreOf(this.#state);
     $("rival-unit").textContent = unitOf(this.#state);

@@ -23,6 +23,6 @@ addEventListener("message", async ({ data }) => {
       // Lets the next task arrive.
       await new Promise((done) => setTimeout(done));
     }
-    postMessage({ episode, state, name: title.replace(/^An? (agent )?/, ""), isOver: state.done });
+    if (last === data) postMessage({ episode, state, name: title.replace(/^An? (agent )?/, ""), isOver: state.done });
   }
 });

@@ -37,7 +37,7 @@ export class Wall {
 
   /** Starts a wall of the environment `wall`, or of all of them. */
   start({ wall, count, by, options = {} }) {
-    const ids = wall === "all" ? this.specs.filter((spec) => spec.frame || spec.picture).map((spec) => spec.id) : [wall];
+    const ids = wall === "all" ? this.specs.filter((spec) => spec.shown).map((spec) => spec.id) : [wall];
     const counts = [...$("wall-count").options].map((option) => option.value);
     const number = counts.includes(count) ? Number(count) : 100;
     const hasExpert = this.specs.some((spec) => ids.includes(spec.id) && spec.has_expert);

@@ -140,8 +140,8 @@ impl Task for CountRecall {
         let most = (parameters.decks * DECK / kinds) as f64;
         let (dealt, rest) = out.split_at_mut(kinds);
         let (queried, shown) = rest.split_at_mut(kinds);
-        self.cards.write_dealt(dealt, |count| count / most);
-        self.queries.write_dealt(queried, |count| count / most);
+        self.cards.write_dealt(dealt, |face| face, |count| count / most);
+        self.queries.write_dealt(queried, |face| face, |count| count / most);
         shown.copy_from_slice(&[self.card, self.query].map(f32::from));
     }
 

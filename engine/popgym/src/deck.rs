@@ -68,10 +68,10 @@ impl Deck {
         self.cards.get(self.left + ago).copied()
     }
 
-    /// Writes how many cards of each face have been dealt, as `share(number)`.
-    pub fn write_dealt(&self, out: &mut [f32], share: impl Fn(f64) -> f64) {
+    /// Writes how many cards of each kind have been dealt, as `share(number)`.
+    pub fn write_dealt(&self, out: &mut [f32], kind: impl Fn(u8) -> u8, share: impl Fn(f64) -> f64) {
         let mut counts = [0.0; DECK];
-        self.cards[self.left..].iter().for_each(|card| counts[usize::from(*card)] += 1.0);
+        self.cards[self.left..].iter().for_each(|card| counts[usize::from(kind(*card))] += 1.0);
         for (out, count) in out.iter_mut().zip(counts) {
             *out = share(count) as f32;
         }

@@ -109,9 +109,7 @@ impl Task for HigherLower {
     }
 
     fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
-        let mut ranks = [0.0; 13];
-        self.deck.cards()[self.deck.left()..].iter().for_each(|card| ranks[usize::from(card / 4)] += 1.0);
-        out.copy_from_slice(&ranks.map(|count| (count / 4.0 / parameters.decks as f64) as f32));
+        self.deck.write_dealt(out, |card| card / 4, |count| count / 4.0 / parameters.decks as f64);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {

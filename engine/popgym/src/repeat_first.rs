@@ -77,7 +77,7 @@ impl Task for RepeatFirst {
     fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
         out[0] = self.first.into();
         let each = (parameters.decks * DECK) as f64 / 4.0;
-        self.deck.write_dealt(&mut out[1..], |count| 1.0 - count / each);
+        self.deck.write_dealt(&mut out[1..], |face| face, |count| 1.0 - count / each);
     }
 
     fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {

@@ -90,7 +90,7 @@ impl Task for RepeatPrevious {
             *out = self.deck.dealt(ago).unwrap_or_default().into();
         }
         let each = (parameters.decks * DECK) as f64 / 4.0;
-        self.deck.write_dealt(left, |count| 1.0 - count / each);
+        self.deck.write_dealt(left, |face| face, |count| 1.0 - count / each);
     }
 
     fn paint(&self, _: &Parameters, canvas: &mut Canvas<'_>) {

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, file};
 use crate::metrics::Episode;
 use crate::rollout::State;
-use crate::settings::{Agent, Settings, VECTORS};
+use crate::settings::{self, Agent, Settings};
 use endless_gym_kernels::network::{Network, Tensor};
 
 /// Names in the folder of a run: the folder of the checkpoints, and the last checkpoint in it.
@@ -241,7 +241,7 @@ impl Checkpoint {
         let mut rest = bytes.into_iter();
         let snapshots = lengths.iter().map(|length| rest.by_ref().take(*length as usize).collect()).collect();
         let starts = starts.iter().map(|start| *start != 0).collect();
-        let actions = match header.settings.environment.wrapper.iter().eq([VECTORS]) {
+        let actions = match settings::has_previous_action(&header.settings.environment.wrapper) {
             true => self.numbers(&tensors, "state/actions", Dtype::I32, &[num_envs, network.spec.choices.len()])?,
             false => Vec::new(),
         };

@@ -12,7 +12,7 @@ use endless_gym_service::{BatchLease, Trainer};
 
 use crate::error::Error;
 use crate::served;
-use crate::settings::{MAX_WIDTH, ONE_HOT, Settings, VECTORS};
+use crate::settings::{self, MAX_WIDTH, ONE_HOT, Settings, VECTORS};
 
 /// Seeds of the training episodes, as in the paper. Evaluation uses others, so its levels are never seen in training.
 const TRAINING_SEEDS: u64 = 100_000;
@@ -246,7 +246,7 @@ impl Environments {
 
     /// Whether observations include the previous action.
     pub fn has_previous_action(&self) -> bool {
-        self.wrapper.iter().eq([VECTORS])
+        settings::has_previous_action(&self.wrapper)
     }
 
     /// Width of the observations that [`observe`](Self::observe) writes.

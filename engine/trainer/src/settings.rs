@@ -22,6 +22,11 @@ pub const VECTORS: &str = "endless_gym_agents.popgym:Vectors";
 /// See [`VECTORS`].
 pub const ONE_HOT: &str = "endless_gym_agents.popgym:OneHot";
 
+/// Whether observations include the previous action, by the wrappers of a run.
+pub(crate) fn has_previous_action(wrappers: &[String]) -> bool {
+    wrappers.iter().eq([VECTORS])
+}
+
 /// File in the folder of a run with its settings.
 pub const SETTINGS: &str = "settings.json";
 

@@ -4,7 +4,7 @@ pub mod file;
 pub mod picture;
 pub mod webp;
 
-use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
+use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs::view::{Picture, rgb_array};
 use endless_gym_core::pool::{Experts, Pool, PoolConfig, PoolError, Registry, ResetRequest, Threads};
 
@@ -38,8 +38,7 @@ impl Film {
         policy: Policy,
         action_seed: u64,
     ) -> Result<Self, Failure> {
-        let frames = Some(Frames::default());
-        let config = config.clone().num_envs(1).total_envs(1).features(true).frames(frames);
+        let config = config.clone().num_envs(1).total_envs(1).features(true).frames(None);
         let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;

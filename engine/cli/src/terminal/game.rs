@@ -26,6 +26,7 @@ impl Game {
         let config = PoolConfig::new(id, 1)
             .options(ResetOptions::Shared(options.clone()))
             .autoreset(Autoreset::Disabled)
+            .frames(None)
             .seeding(Seeding::Continue { seed: Some(seed) });
         let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());

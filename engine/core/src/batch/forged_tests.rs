@@ -202,7 +202,7 @@ proptest! {
     fn forged_layouts_are_refused_or_usable(
         id in 0..3_usize,
         num_envs in 1..5_usize,
-        options in 0..8_u8,
+        options in 0..16_u8,
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), values()), 1..3),
     ) {
         let spec = toys().specs().nth(id).unwrap();
@@ -210,7 +210,7 @@ proptest! {
             frames: (options & 1 != 0).then(Frames::default),
             features: options & 2 != 0,
             state: options & 4 != 0,
-            final_observation: options & 4 != 0,
+            final_observation: options & 8 != 0,
         };
         let layout = batch_layout(spec, num_envs, contents).unwrap();
         use_all(&layout)?;

@@ -134,7 +134,7 @@ pub enum PoolError {
         /// Number of environments in the pool.
         num_envs: usize,
     },
-    /// The environment has only features, and no frame to show.
+    /// The environment has neither frames nor pictures, only features.
     #[error("{id} has no frames to show, only features")]
     NoFrame {
         /// The environment id.
