@@ -212,7 +212,7 @@ def test_names_of_runs_and_their_costs_are_read(tmp_path: Path) -> None:
     evaluated(folder / "evaluation.json", "gru", 2, [0.1])
     row = {"agent": "gru", "size": "small", "task": "two-commands", "seed": 1, "score": 0.2, "steps": 64}
     (tmp_path / "rows.json").write_text(
-        json.dumps({"rows": [row | {"minutes": 2, "state_bytes": 512, "longer": None}]})
+        json.dumps({"rows": [row | {"core_seconds": 120, "state_bytes": 512, "longer": None}]})
     )
     (found,), _ = compare.read_scores([tmp_path / "runs"])
     assert found.agent == "long"

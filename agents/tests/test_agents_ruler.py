@@ -81,7 +81,7 @@ def test_agents_of_popgym_resume_exactly(tmp_path: Path) -> None:
 
 
 def mean_row(agent: str, task: str, seed: int, score: float) -> dict[str, Any]:
-    base = {"size": "-", "parameters": 1, "acting": 1, "learning": 1, "state_bytes": 1, "minutes": 1, "steps": 10}
+    base = {"size": "-", "parameters": 1, "acting": 1, "learning": 1, "state_bytes": 1, "core_seconds": 60, "steps": 10}
     return {"agent": agent, "task": task, "seed": seed, "score": score, "longer": score / 2} | base
 
 
@@ -136,7 +136,7 @@ TUNING: dict[str, Any] = {
     "trials": 3,
     "space": {"ppo.learning-rate": [1e-3, 3e-4], "ppo.entropy-coefficient": [1e-3, 1e-4]},
     "of": {"other": {"recurrence.layers": [1, 2]}},
-    "own": {"lru": {"agent-option": [[], ["block=false"]]}},
+    "own": {"lru": {"agent-option": [[], ["r_min=0.9"]]}},
 }
 
 

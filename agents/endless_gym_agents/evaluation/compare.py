@@ -402,7 +402,6 @@ def of_row(row: Mapping[str, Any], file: Path) -> Score:
     """A row of `endless-leaderboard`; agents without memory have the size `-`, and others `gru` by default."""
     agent = row["agent"] if row.get("size", "-") in ("-", "gru") else f"{row['agent']} ({row['size']})"
     cost = {name: float(row[name]) for name in COSTS if row.get(name) is not None}
-    cost |= {"core_seconds": 60.0 * row["minutes"]} if "minutes" in row else {}
     source = f"{file}, {row['agent']} {row.get('size', '-')}"
     return Score(agent, row["task"], int(row["seed"]), float(row["score"]), int(row["steps"]), source, cost)
 

@@ -1,4 +1,4 @@
-"""`endless-enjoy`: record a video of a trained agent, or, in environments without frames, print what it sees.
+"""`endless-enjoy`: record a video of a trained agent, or, in environments without pictures, print what it sees.
 
 A video shows its frames next to the ground-truth view.
 

@@ -22,6 +22,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from endless_gym_agents.memories.layers import undecayed
 from endless_gym_agents.memories.scans import linear_scan
 from endless_gym_agents.memories.sequence_model import SequenceModel, State
 
@@ -36,10 +37,8 @@ class FFM(SequenceModel):
         self.parts = [traces, traces, width, width]
         self.enter = nn.Linear(input_width, sum(self.parts))
         self.fastest = math.log(torch.finfo(torch.float64).max) / longest - 0.01
-        self.a = nn.Parameter(torch.linspace(self.fastest - 0.01, -math.log(0.01) / longest, traces))
-        self.b = nn.Parameter(2 * math.pi / torch.linspace(1, longest, contexts))
-        for decays in (self.a, self.b):
-            decays._no_weight_decay = True  # type: ignore[attr-defined]
+        self.a = undecayed(torch.linspace(self.fastest - 0.01, -math.log(0.01) / longest, traces))
+        self.b = undecayed(2 * math.pi / torch.linspace(1, longest, contexts))
         self.mix = nn.Linear(2 * traces * contexts, width)
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
 

@@ -418,11 +418,7 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
         number = max(len(one["trials"]) for one in tuning.values())
         lines += [f"Each agent was tuned with up to {number} configurations on a task outside of the table.", ""]
     else:
-        lines += [
-            "Each row is one untuned configuration of a memory, whose layers differ from the published ones: the table does not",
-            "say which memory is best.",
-            "",
-        ]
+        lines += ["Each row is one untuned configuration: the table does not say which memory is best.", ""]
     lines += [
         "The expert sees the whole state, so the optimality gap is that to the fully observable task. Acting and learning are",
         "environment steps per second in that phase of training, in the run that other work disturbed least; they depend on the",

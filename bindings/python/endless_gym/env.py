@@ -80,6 +80,7 @@ class Env(gymnasium.Env[Any, Any]):
         id: Environment id, such as `MortarMayhem-v0`.
         render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
             (336, 336, 3); both indexed `[row][column][channel]`. `human`: every step shows that view in a window (needs pygame).
+            Without frames, these show the picture of the observation.
             `ansi`, in environments without frames and only there: what the agent sees as text, such as `suit hearts`.
         options: Reset parameters for every episode. Options of `reset` override them.
         observation: `rgb` for frames, `features` for a vector that describes what the frame shows, or `rgb+features` for a dict

@@ -141,7 +141,11 @@ class StatePart(NamedTuple):
 
     def values(self, numbers: NDArray[np.float32], dtype: str | None = None) -> NDArray[Any]:
         """Numbers (..., width) with its shape and its dtype, or that of its space."""
-        return numbers.astype(dtype or self.gymnasium_space().dtype).reshape(numbers.shape[:-1] + self.shape)
+        if dtype is None:
+            # The dtypes of Gymnasium's MultiBinary, Discrete and MultiDiscrete, and Box.
+            kind = self.space if isinstance(self.space, str) else next(iter(self.space))
+            dtype = {"Binary": "int8", "Integers": "int64", "Box": "float32"}[kind]
+        return numbers.astype(dtype).reshape(numbers.shape[:-1] + self.shape)
 
 
 class OriginalTypes(NamedTuple):

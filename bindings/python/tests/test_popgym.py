@@ -95,6 +95,7 @@ def test_batches_have_the_states(id: str, make: Any) -> None:
     single.reset(seed=5)
     with make(id, 2, seed=4, autoreset="same_step", state=True) as envs:
         _, info = envs.reset()
+        envs.action_space.seed(1)
         described, ended = endless_gym.spec(id), False
         while not ended:
             state = described.states(info["state"])
