@@ -86,8 +86,8 @@ def make_vec(
         first_env: Number of the first environment, for seeds, if the environments of one trainer are divided among several calls,
             for example one for each rank of a data-parallel run: environment `i` is numbered `first_env + i`.
         total_envs: Total number of environments of all these calls; `None` for `first_env` plus those of this call.
-        render_mode: What `render` returns: `rgb_array` for frames, or the pictures of environments without frames; `debug_rgb_array`
-            for ground-truth views; and, without frames, also `ansi` for texts of what the agents see.
+        render_mode: What `render` returns: `rgb_array` for frames, or the pictures of environments without frames;
+            `debug_rgb_array` for ground-truth views; and, without frames, also `ansi` for texts of what the agents see.
         view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
         episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between
             steps, before the step in which the episode may begin; with same-step auto-reset, that is one episode ahead.
