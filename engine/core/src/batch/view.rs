@@ -25,6 +25,18 @@ impl<T> RowsMut<'_, T> {
         &mut self.numbers.as_mut()[env * self.width..(env + 1) * self.width]
     }
 
+    /// Writes the row of one environment, if the batch has the section.
+    ///
+    /// # Panics
+    ///
+    /// If `env` is out of range.
+    #[inline]
+    pub(crate) fn write(&mut self, env: usize, write: impl FnOnce(&mut [T])) {
+        if self.width > 0 {
+            write(self.row(env));
+        }
+    }
+
     /// Sets the number of one environment in a section with one number per environment.
     ///
     /// # Panics

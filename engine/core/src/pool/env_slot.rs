@@ -150,10 +150,10 @@ impl<E: Environment> EnvSlot<E> {
 
     /// Writes the observations other than the frames.
     fn write_numbers(&self, out: &mut BatchMut<'_>, row: usize) {
-        write_if_present(out.vector_observation.row(row), |r| self.env.vector_observation(r));
-        write_if_present(out.features.row(row), |r| self.env.features(r));
-        write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
-        write_if_present(out.state.row(row), |r| self.env.markov_state(r));
+        out.vector_observation.write(row, |r| self.env.vector_observation(r));
+        out.features.write(row, |r| self.env.features(r));
+        out.ground_truth.write(row, |r| self.env.ground_truth(r));
+        out.state.write(row, |r| self.env.markov_state(r));
     }
 
     /// Updates the frames of the observation. `drawn` holds the scene that was last drawn into each frame.
@@ -181,20 +181,14 @@ impl<E: Environment> EnvSlot<E> {
     }
 
     fn write_final_observation(&self, draw: DrawSettings, out: &mut BatchMut<'_>, row: usize) {
-        write_if_present(out.final_observation.row(row), |r| {
+        out.final_observation.write(row, |r| {
             for (stacked, frame) in self.frames().zip(r.chunks_exact_mut(r.len() / self.frame_stack.length())) {
                 self.draw_stacked(&stacked, draw.frame, frame);
             }
         });
-        write_if_present(out.final_vector_observation.row(row), |r| self.env.vector_observation(r));
-        write_if_present(out.final_features.row(row), |r| self.env.features(r));
-        write_if_present(out.final_ground_truth.row(row), |r| self.env.ground_truth(r));
-        write_if_present(out.final_state.row(row), |r| self.env.markov_state(r));
-    }
-}
-
-fn write_if_present<T>(row: &mut [T], write: impl FnOnce(&mut [T])) {
-    if !row.is_empty() {
-        write(row);
+        out.final_vector_observation.write(row, |r| self.env.vector_observation(r));
+        out.final_features.write(row, |r| self.env.features(r));
+        out.final_ground_truth.write(row, |r| self.env.ground_truth(r));
+        out.final_state.write(row, |r| self.env.markov_state(r));
     }
 }
