@@ -10,7 +10,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from endless_gym.popgym import PreviousAction
+from endless_gym.popgym import Markovian, Observability, PreviousAction
 
 
 class Vectors(PreviousAction):
@@ -41,3 +41,12 @@ class OneHot(Vectors):
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(envs, previous_action=False, antialias=False)
+
+
+class States(Vectors):
+    """The hidden Markov state in place of the observation, as float32 vectors in which integers are one-hot: the fully observable
+    twin of an environment that tells its state.
+    """
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(Markovian(envs, Observability.FULL), previous_action=False, antialias=False)

@@ -34,8 +34,9 @@ TRAINING_SEEDS = range(100_000)
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
 
-#: The wrapper in environments whose observations are not vectors, and that of runs of `endless learn` whose settings have none.
-VECTORS, ONE_HOT = (f"endless_gym_agents.popgym:{name}" for name in ("Vectors", "OneHot"))
+#: The wrapper in environments whose observations are not vectors, that of runs of `endless learn` whose settings have none, and
+#: that of fully observable twins.
+VECTORS, ONE_HOT, STATES = (f"endless_gym_agents.popgym:{name}" for name in ("Vectors", "OneHot", "States"))
 
 
 def paper_run_length(env: str, agent: str) -> int:
@@ -78,6 +79,11 @@ class Environment:
     """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
     num_threads: Natural = 0
     """threads that step the environments; 0 for one per core"""
+
+    @property
+    def shows_state(self) -> bool:
+        """Whether a wrapper needs the Markov state."""
+        return STATES in self.wrapper
 
     @property
     def own_wrappers(self) -> tuple[str, ...]:

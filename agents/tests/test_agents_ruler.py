@@ -7,13 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from agents_helpers import changed
+from gymnasium.spaces import flatten
 
 from endless_gym import spec
 from endless_gym_agents.agent.agent import make_agent
+from endless_gym_agents.environments import wrappers
 from endless_gym_agents.evaluation import conformance, ruler
+from endless_gym_agents.evaluation.evaluate import evaluate
 from endless_gym_agents.evaluation.ruler import TASKS
 from endless_gym_agents.paper import leaderboard
 from endless_gym_agents.paper.experiments.definitions import settings_of
@@ -41,6 +45,24 @@ def test_a_longer_version_fits_the_agents_of_its_task() -> None:
             made, longer = (make_agent(each, spec(each.env)) for each in (given.validated(), other))
             assert (made.observation_shapes, made.branches) == (longer.observation_shapes, longer.branches), task.name
             assert other.options() != given.options() or env != task.env
+
+
+@pytest.mark.parametrize("name", ["two-commands", "count-recall", "labyrinth"])
+def test_a_twin_shows_the_state(name: str, tmp_path: Path) -> None:
+    env, flags = TASKS[name].twin() or ("", {})
+    small = {"ppo.updates": 1, "ppo.steps": 8, "environment.num-envs": 2, "ppo.minibatches": 1}
+    given = settings_of(env, {"preset": "quick", **flags, **small})
+    settings = replace(given, run=str(tmp_path), device="cpu").validated()
+    training.train(settings)
+    assert list(evaluate(checkpoint.load(tmp_path).agent, [200_000], 1, num_threads=1))
+    if env == TASKS[name].env:
+        with wrappers.make(settings, 2, 1, seed=3) as envs:
+            observation, info = envs.reset()
+            space, states = envs.unwrapped.single_state_space, spec(env).states(info["state"])
+            first = tuple(part[0] for part in states) if isinstance(states, tuple) else states[0]
+            assert np.array_equal(observation[0], flatten(space, first))
+    else:
+        assert env == "MortarMayhemB-Grid-v0"
 
 
 @pytest.mark.parametrize("name", ["laptop", "full"])

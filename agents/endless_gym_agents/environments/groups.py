@@ -98,6 +98,7 @@ class Environments:
             "options": settings.options(),
             "autoreset": "same_step",
             "observation": wanted.observation,
+            "state": wanted.shows_state,
             "first_env": own.start,
             "total_envs": wanted.num_envs,
             "pin_memory": pin_memory,
@@ -144,8 +145,9 @@ class Environments:
         done = terminated | truncated
         episodes = []
         if "final_info" in info:
-            final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
-            final.pop("ground_truth", None)
+            # Numbers of episodes, without masks, the ground truth and the Markov state.
+            every = info["final_info"].items()
+            final = {key: value for key, value in every if not key.startswith("_") and value.ndim == 1}
             episodes = [{key: float(value[env]) for key, value in final.items()} for env in np.flatnonzero(done)]
         ended_by_time, last, truth = truncated & ~terminated, info.get("final_obs"), info.get("ground_truth")
         return StepResult(observation, reward, done, ended_by_time, last, truth, episodes)

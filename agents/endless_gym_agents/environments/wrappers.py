@@ -213,8 +213,9 @@ def make(settings: Settings, num_envs: int, num_threads: int | None = None, **ar
     Raises:
         ValueError: As for `make_vec` and `wrap`.
     """
-    known = {"options": settings.options(), "observation": settings.environment.observation, "autoreset": "same_step"}
-    with make_vec(settings.env, num_envs, num_threads, **known | arguments) as envs:
+    wanted = settings.environment
+    known = {"options": settings.options(), "observation": wanted.observation, "state": wanted.shows_state}
+    with make_vec(settings.env, num_envs, num_threads, **{"autoreset": "same_step"} | known | arguments) as envs:
         yield wrap(settings, envs)
 
 

@@ -59,7 +59,7 @@ def evaluate(
             first = [env for env in np.flatnonzero(done) if not results[env]]
             for env in first:
                 final = info["final_info"]
-                names = [name for name in final if not name.startswith("_") and name != "ground_truth"]
+                names = [name for name in final if not name.startswith("_") and final[name].ndim == 1]
                 result = {name: float(final[name][env]) for name in names}
                 results[env] = result | {"seed": float(episode_seeds[env])}
             if ended is not None and first:

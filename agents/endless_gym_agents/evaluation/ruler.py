@@ -12,7 +12,7 @@ python -m endless_gym_agents.ruler          # plays experts and random actions, 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,10 +23,11 @@ from endless_gym.create import make_vec
 from endless_gym.experts import Experts
 from endless_gym.specs import spec
 from endless_gym_agents.common import command
-from endless_gym_agents.settings import VECTORS, Environment, Settings
+from endless_gym_agents.settings import STATES, VECTORS, Environment, Settings
 
-#: What a task measures: which of several things was seen; where something is; in which order things were seen; how many.
-Label = Literal["object", "spatial", "sequential", "capacity"]
+#: What a task measures: which of several things was seen; where something is; in which order things were seen; how many; whether
+#: what was seen last replaces what was seen before.
+Label = Literal["object", "spatial", "sequential", "capacity", "rewriting"]
 #: Share of the way from random actions to the expert that an agent without memory must not reach.
 GATE = 0.5
 #: Seeds of the episodes of experts and random actions; the evaluation's first ones.
@@ -46,7 +47,8 @@ class Task:
         options: Reset parameters, each as NAME=VALUE.
         longer: Environment id and reset parameters of a longer version, on which trained agents are evaluated; None if none fits
             their observations and actions.
-        observable: Id of the fully observable variant; empty if there is none.
+        observable: Flags of `endless-train`, of which `env` is another environment, that make the task fully observable; None if
+            nothing does.
     """
 
     name: str
@@ -56,13 +58,20 @@ class Task:
     random: float
     options: tuple[str, ...] = ()
     longer: tuple[str, tuple[str, ...]] | None = None
-    observable: str = ""
+    observable: Mapping[str, Any] | None = None
 
     def flags(self) -> dict[str, Any]:
         """Flags of `endless-train` for this task, without `env`."""
         chosen: dict[str, Any] = {"environment.option": list(self.options)} if self.options else {}
         popgym: dict[str, Any] = {"environment.wrapper": [VECTORS], "environment.observation": "features"}
         return chosen | (popgym if self.env.startswith("popgym") else {})
+
+    def twin(self) -> tuple[str, dict[str, Any]] | None:
+        """Environment id and flags of the fully observable task; None if there is none."""
+        described = spec(self.env)
+        states = {"environment.wrapper": [STATES]} if described.markov_state else None
+        changed = dict(self.observable or states or {})
+        return (changed.pop("env", self.env), self.flags() | changed) if changed else None
 
     def passes_gate(self, memoryless: float) -> bool:
         """Whether an agent without memory with this mean return fails the task, as it must."""
@@ -76,8 +85,8 @@ class Task:
 def _mayhem(
     name: str, label: Label, expert: float, random: float, options: tuple[str, ...], longer: tuple[str, ...]
 ) -> Task:
-    grid, observable = "MortarMayhem-Grid-v0", "MortarMayhemB-Grid-v0"
-    return Task(name, label, grid, expert, random, options, (grid, longer), observable)
+    grid = "MortarMayhem-Grid-v0"
+    return Task(name, label, grid, expert, random, options, (grid, longer), {"env": "MortarMayhemB-Grid-v0"})
 
 
 _OPEN = ("show_origin=true", "show_goal=true")

@@ -95,10 +95,12 @@ class Entry:
     Attributes:
         name: Name in the table.
         flags: Flags of its runs, with `agent`.
+        observable: Whether it trains on the fully observable twins of the tasks, where there are any.
     """
 
     name: str
     flags: Flags
+    observable: bool = False
 
     @property
     def agent(self) -> str:
@@ -139,8 +141,11 @@ class Track:
     rows: dict[str, Any]
 
     def run(self, task: Task, entry: Entry, size: str, chosen: Mapping[str, Any] | None = None) -> tuple[Task, Flags]:
-        """The task, and the flags of a run of it."""
-        flags = self.flags | task.flags() | self.task_flags.get(task.name, {})
+        """The task, or its fully observable twin, and the flags of a run of it."""
+        own = task.flags()
+        if entry.observable and (twin := task.twin()):
+            task, own = dataclasses.replace(task, env=twin[0], longer=None), twin[1]
+        flags = self.flags | own | self.task_flags.get(task.name, {})
         # The flags of a size are those of the agent, or of all others.
         flags |= {} if size == "-" else self.sizes[size].get(entry.agent, self.sizes[size]["other"])
         return task, flags | entry.flags | dict(chosen or {})
@@ -218,10 +223,11 @@ def _task(given: Any, where: str) -> Task:
         if given not in TASKS:
             raise ValueError(f"{where}: a task must be an object, or one of {', '.join(TASKS)}; got `{given}`")
         return TASKS[given]
-    one = _checked(given, "env", ("name", "options", "zero", "expert"), f"{where}, tasks")
+    one = _checked(given, "env", ("name", "options", "zero", "expert", "observable"), f"{where}, tasks")
     try:
         env = spec(one["env"]).full_id
-        task = Task(_named(one.get("name", env), where), "object", env, 0.0, 0.0, tuple(one.get("options", ())))
+        name, options = _named(one.get("name", env), where), tuple(one.get("options", ()))
+        task = Task(name, "object", env, 0.0, 0.0, options, observable=one.get("observable"))
         return dataclasses.replace(task, expert=float(one.get("expert") or ruler.mean_return(task, expert=True)))
     except ValueError as error:
         raise ValueError(
@@ -234,8 +240,9 @@ def _entry(given: Any, where: str = "--agents") -> Entry:
     if isinstance(given, str):
         # A name is a folder.
         return Entry(_named(Path(given).name, where), {"agent": given})
-    one = _checked(given, "name", ("agent", "flags"), f"{where}, agents")
-    return Entry(_named(one["name"], where), {"agent": one.get("agent", one["name"])} | one.get("flags", {}))
+    one = _checked(given, "name", ("agent", "flags", "observable"), f"{where}, agents")
+    flags = {"agent": one.get("agent", one["name"])} | one.get("flags", {})
+    return Entry(_named(one["name"], where), flags, bool(one.get("observable")))
 
 
 def trials(track: Track, entry: Entry, own: Mapping[str, Sequence[Any]] | None = None) -> list[Flags]:
@@ -485,12 +492,14 @@ def execute(arguments: LeaderboardArguments) -> None:
     named, runs = {}, {}
     for task in (track.tasks[name] for name in arguments.tasks or track.tasks):
         for entry, size in track.sized(entries, arguments.sizes):
+            if entry.observable and task.twin() is None:
+                continue
             tuning = data["tuning"].get(f"{entry.name} {size}")
             chosen = tuning["trials"][tuning["best"]]["flags"] if tuning else {}
             name = f"{task.name} {entry.name} {size}"
             spent = {"tuning_core_seconds": sum(one["core_seconds"] for one in tuning["trials"])} if tuning else {}
-            named[name] = task, {"agent": entry.name, "size": size, "task": task.name} | spent
             runs[name] = track.run(task, entry, size, chosen)
+            named[name] = runs[name][0], {"agent": entry.name, "size": size, "task": task.name} | spent
     torch.set_num_threads(1)
     jobs, failure = trained(track, "runs", runs, arguments.seeds or track.seeds, arguments)
     rows = {tuple(one[key] for key in KEYS): one for one in data["rows"]}

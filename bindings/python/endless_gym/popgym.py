@@ -402,7 +402,7 @@ def _flattened(space: spaces.Space[Any], batch: NDArray[Any]) -> NDArray[Any]:
     if isinstance(space, spaces.Discrete):
         return _one_hot(int(space.n), batch)
     if isinstance(space, spaces.MultiDiscrete):
-        columns = zip(space.nvec, batch.T, strict=True)
+        columns = zip(space.nvec.flat, batch.reshape(len(batch), -1).T, strict=True)
         return np.concatenate([_one_hot(int(choices), column) for choices, column in columns], axis=1)
     return batch.reshape(len(batch), -1)
 
