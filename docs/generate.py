@@ -201,7 +201,7 @@ FORMAT = re.compile(r'#\[error\(\s*"((?:[^"\\]|\\.)*)"(.*?)\)\]\n', re.S)
 #: Documentation, attribute, name and fields of a variant.
 VARIANT = re.compile(
     r"((?:^    ///[^\n]*\n)+)(?:^    #\[(?!error)[^\n]*\n)*^    (#\[error\(.*?\)\]\n)(?:^    #\[[^\n]*\n)*^    (\w+)"
-    r"( \{.*?^    \},$|[^\n]*$)",
+    r"( \{\n.*?^    \},$|[^\n]*$)",
     re.M | re.S,
 )
 

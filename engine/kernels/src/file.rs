@@ -29,6 +29,7 @@ pub const PAGE_AGENTS: [(&str, &str); 6] = [
 
 /// Why a file cannot be read; the text says it of the file.
 #[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum FileError {
     /// The format is another, or a part is missing.
     #[error("is damaged: it must be in the format safetensors: {0}")]
@@ -37,19 +38,13 @@ pub enum FileError {
     #[error(
         "is damaged, or has far more tensors than a network: their description has {given} bytes of at most {MAX_DESCRIPTION}"
     )]
-    Tensors {
-        /// Bytes of the description.
-        given: u64,
-    },
+    Tensors { given: u64 },
     /// The header is not JSON with a version.
     #[error("is damaged: its header cannot be read: {0}")]
     Header(#[from] serde_json::Error),
     /// Another version of this program wrote it.
     #[error("must be of version 1 to {VERSION}, got {given}")]
-    Version {
-        /// The version.
-        given: u32,
-    },
+    Version { given: u32 },
     /// A byte has changed since the file was written.
     #[error("is damaged: its checksum differs")]
     Checksum,

@@ -19,23 +19,18 @@ pub(crate) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Why an engine, trainer or observer could not be created, or a call on one failed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum ServiceError {
     /// An engine name is malformed.
     #[error("engine name must be 1 to {max_length} letters, digits, `.`, `_` or `-`, got `{given}`")]
     InvalidName {
-        /// The name that was given.
         given: String,
         /// Maximum length in bytes.
         max_length: usize,
     },
     /// The root directory of the namespace cannot be used.
     #[error("root directory {} cannot be used: {reason}; set ENDLESS_GYM_ROOT to another directory", path.display())]
-    Root {
-        /// The root directory.
-        path: PathBuf,
-        /// Why it cannot be used.
-        reason: String,
-    },
+    Root { path: PathBuf, reason: String },
     /// The namespace's directory, or the file in it that identifies the namespace, was removed or replaced while this process used
     /// it.
     #[error(
@@ -43,94 +38,51 @@ pub enum ServiceError {
          reconnect, or start the engine again; set ENDLESS_GYM_ROOT to a directory that nothing cleans up",
         path.display()
     )]
-    RootRemoved {
-        /// The namespace's root directory.
-        path: PathBuf,
-    },
+    RootRemoved { path: PathBuf },
     /// Another user has created a shared memory segment with the names of this namespace.
     #[error(
         "{} belongs to user {owner}, and segments of the namespace {} must belong to user {}, who runs this process; end the \
          engines and trainers of this namespace and try again, or set ENDLESS_GYM_ROOT to another directory",
         path.display(), root.display(), rustix::process::getuid().as_raw()
     )]
-    ForeignSegment {
-        /// The segment.
-        path: PathBuf,
-        /// The user to whom it belongs.
-        owner: u32,
-        /// The namespace's root directory.
-        root: PathBuf,
-    },
+    ForeignSegment { path: PathBuf, owner: u32, root: PathBuf },
     /// Another process held the namespace's lock for too long.
     #[error(
         "root directory {} has been locked for {waited:?} by {}",
         path.display(), LockHolder::text(*holder)
     )]
-    NamespaceLocked {
-        /// The namespace's root directory.
-        path: PathBuf,
-        /// How long this process waited for the lock.
-        waited: Duration,
-        /// The process that holds the lock, if it can be found.
-        holder: Option<LockHolder>,
-    },
+    NamespaceLocked { path: PathBuf, waited: Duration, holder: Option<LockHolder> },
     /// An engine of that name is running but cannot be used: it is starting or ending, or some of its files were
     /// removed.
     #[error("engine `{service}` is running and cannot be reached; try again, and restart it if the error stays")]
-    EngineUnreachable {
-        /// The engine's name.
-        service: String,
-    },
+    EngineUnreachable { service: String },
     /// No engine of that name is running.
     #[error(
         "no engine `{service}` is running in {}; running engines: {}; start it, or set ENDLESS_GYM_ROOT to the same directory for both \
          processes",
         root.display(), names(running)
     )]
-    UnknownEngine {
-        /// The name that was looked for.
-        service: String,
-        /// The namespace's root directory.
-        root: PathBuf,
-        /// Names of the engines that are running in the namespace, sorted.
-        running: Vec<String>,
-    },
+    UnknownEngine { service: String, root: PathBuf, running: Vec<String> },
     /// An engine of that name is already running.
     #[error("engine `{service}` is already running{}; stop it, or choose another name", in_process(*pid))]
-    EngineExists {
-        /// The engine's name.
-        service: String,
-        /// Its process id, if known.
-        pid: Option<u32>,
-    },
+    EngineExists { service: String, pid: Option<u32> },
     /// The engine already has a trainer.
     #[error(
         "engine `{service}` already has a trainer{} and accepts only one; stop that trainer, or connect as an observer",
         in_process(*pid)
     )]
-    TrainerExists {
-        /// The engine's name.
-        service: String,
-        /// Process id of the trainer, if known.
-        pid: Option<u32>,
-    },
+    TrainerExists { service: String, pid: Option<u32> },
     /// The engine already has as many observers as it accepts.
     #[error(
         "engine `{service}` already has {limit} observers; stop one, or start the engine with a larger `observers`"
     )]
-    TooManyObservers {
-        /// The engine's name.
-        service: String,
-        /// Number of observers that the engine accepts.
-        limit: usize,
-    },
+    TooManyObservers { service: String, limit: usize },
     /// The engine uses another version of the memory layout or of iceoryx2.
     #[error(
         "engine `{service}` must have layout version {LAYOUT_VERSION} (endless-gym {PACKAGE_VERSION}), got {layout} (endless-gym \
          {package}); install the same version for both processes"
     )]
     Version {
-        /// The engine's name.
         service: String,
         /// Its layout version, or `unknown`.
         layout: String,
@@ -139,32 +91,15 @@ pub enum ServiceError {
     },
     /// The engine's messages have another type.
     #[error("engine `{service}` uses other message types; install the same version of endless-gym for both processes")]
-    IncompatibleTypes {
-        /// The engine's name.
-        service: String,
-    },
+    IncompatibleTypes { service: String },
     /// The engine's specification is malformed.
     #[error(
         "specification of engine `{service}` is invalid: {reason}; install the same version of endless-gym for both processes"
     )]
-    Specification {
-        /// The engine's name.
-        service: String,
-        /// What is wrong with it.
-        reason: String,
-    },
+    Specification { service: String, reason: String },
     /// A number of an [`EngineConfig`](crate::EngineConfig) is out of range.
     #[error("{name} must be {lowest} to {highest}, got {given}")]
-    OutOfRange {
-        /// The field's name.
-        name: &'static str,
-        /// The number that was given.
-        given: usize,
-        /// Smallest valid number.
-        lowest: usize,
-        /// Largest valid number.
-        highest: usize,
-    },
+    OutOfRange { name: &'static str, given: usize, lowest: usize, highest: usize },
     /// A timeout is negative or not finite.
     #[error("timeout must be finite and not negative, got {given}")]
     InvalidTimeout {
@@ -182,7 +117,6 @@ pub enum ServiceError {
         needed: u64,
         /// Bytes that are free.
         available: u64,
-        /// The file system.
         path: &'static str,
     },
     /// The control group of this process may not have as much memory.
@@ -205,19 +139,11 @@ pub enum ServiceError {
     DescriptorLimit {
         /// Descriptors that are needed, including those already open.
         needed: u64,
-        /// The limit (`RLIMIT_NOFILE`).
         limit: u64,
     },
     /// The engine has no group of that number.
     #[error("group must be 0 to {} in engine `{service}`, got group {given}", groups.saturating_sub(1))]
-    NoSuchGroup {
-        /// The engine's name.
-        service: String,
-        /// The group that was given.
-        given: usize,
-        /// Number of groups of the engine.
-        groups: usize,
-    },
+    NoSuchGroup { service: String, given: usize, groups: usize },
     /// The groups are not those of one trainer.
     #[error(
         "the groups must belong to one trainer, and be all of its groups where a trainer is made of them or reconnects"
@@ -228,38 +154,21 @@ pub enum ServiceError {
     Action(#[from] ActionError),
     /// A reset request has the wrong length.
     #[error("a reset of single environments must have {num_envs} items, one for each environment, got {given}")]
-    ResetCount {
-        /// Number of items that were given.
-        given: usize,
-        /// Environments in the group.
-        num_envs: usize,
-    },
+    ResetCount { given: usize, num_envs: usize },
     /// Reset parameters do not fit into a message.
     #[error("reset parameters must have at most {OPTIONS_BYTES} bytes as JSON, got {given}; use shorter lists")]
-    OptionsTooLong {
-        /// Bytes of the JSON text.
-        given: usize,
-    },
+    OptionsTooLong { given: usize },
     /// A snapshot does not fit into a message.
     #[error(
         "snapshot must have at most {SNAPSHOT_BYTES} bytes, got {given}; restore it with `Pool::restore` in this process"
     )]
-    SnapshotTooLong {
-        /// Bytes of the snapshot.
-        given: usize,
-    },
+    SnapshotTooLong { given: usize },
     /// The group has not answered the last request yet.
     #[error("group {group} has a pending answer; receive it before the next request")]
-    AnswerPending {
-        /// The group.
-        group: usize,
-    },
+    AnswerPending { group: usize },
     /// The group has no request to answer.
     #[error("nothing was sent to group {group}; reset or step it before receiving")]
-    NothingSent {
-        /// The group.
-        group: usize,
-    },
+    NothingSent { group: usize },
     /// No group has a request to answer.
     #[error("no group has a pending answer; reset or step one before receiving")]
     NothingPending,
@@ -267,64 +176,25 @@ pub enum ServiceError {
     #[error(
         "{limit} batches of group {group} are held, the maximum of this engine; drop one, or copy the data to keep"
     )]
-    TooManyBatchesHeld {
-        /// The group.
-        group: usize,
-        /// Number of batches that may be held at a time.
-        limit: usize,
-    },
+    TooManyBatchesHeld { group: usize, limit: usize },
     /// No answer has arrived in time from an engine that is running.
     #[error("no answer from engine `{service}` within {waited:?}; {activity}")]
-    TimedOut {
-        /// The engine's name.
-        service: String,
-        /// How long the caller waited.
-        waited: Duration,
-        /// What the engine is doing.
-        activity: EngineActivity,
-    },
+    TimedOut { service: String, waited: Duration, activity: EngineActivity },
     /// The engine's process has ended.
     #[error("engine `{service}`{} has ended; start it again and reconnect", in_process(Some(*pid)))]
-    EngineLost {
-        /// The engine's name.
-        service: String,
-        /// Its process id.
-        pid: u32,
-    },
+    EngineLost { service: String, pid: u32 },
     /// The engine was replaced by another one of the same name.
     #[error("engine `{service}` was restarted, and its episodes are lost; reconnect and reset")]
-    EngineRestarted {
-        /// The engine's name.
-        service: String,
-    },
+    EngineRestarted { service: String },
     /// The engine was replaced by one that serves different environments.
     #[error("engine `{service}` was restarted with another {what}; create a new connection")]
-    SpecificationChanged {
-        /// The engine's name.
-        service: String,
-        /// The first property that differs between the two.
-        what: &'static str,
-    },
+    SpecificationChanged { service: String, what: &'static str },
     /// The engine rejected a request. Except for [`Rejection::Panic`], no environment has changed.
     #[error("engine `{service}` rejected the request for group {group}: {message}")]
-    Rejected {
-        /// The engine's name.
-        service: String,
-        /// The group.
-        group: usize,
-        /// The kind of fault.
-        reason: Rejection,
-        /// The engine's explanation.
-        message: String,
-    },
+    Rejected { service: String, group: usize, reason: Rejection, message: String },
     /// An environment of the engine panicked, and the engine ends: its code has a defect.
     #[error("the engine ends, since in group {group} {panic}")]
-    Panic {
-        /// The group.
-        group: usize,
-        /// The environment, its seed, and the message of the panic.
-        panic: String,
-    },
+    Panic { group: usize, panic: String },
     /// The environments could not be created, or there is no environment of that number.
     #[error(transparent)]
     Pool(#[from] PoolError),
@@ -333,32 +203,13 @@ pub enum ServiceError {
     Checkpoint(#[from] CheckpointError),
     /// iceoryx2 failed in a process whose memory or files are limited.
     #[error("{action}, and {limits}; raise the limit, or use fewer environments or groups ({reason})")]
-    ResourceLimit {
-        /// What failed.
-        action: &'static str,
-        /// The limits (`RLIMIT_AS`, `RLIMIT_FSIZE`).
-        limits: String,
-        /// iceoryx2's error.
-        reason: String,
-    },
+    ResourceLimit { action: &'static str, limits: String, reason: String },
     /// The operating system refuses an operation on a file of the namespace.
     #[error("{action}: {}: {source}", path.display())]
-    File {
-        /// What failed.
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The operating system's error.
-        source: io::Error,
-    },
+    File { action: &'static str, path: PathBuf, source: io::Error },
     /// An unexpected error of iceoryx2.
     #[error("{action}: {reason}")]
-    Middleware {
-        /// What failed.
-        action: &'static str,
-        /// iceoryx2's error.
-        reason: String,
-    },
+    Middleware { action: &'static str, reason: String },
 }
 
 /// What a caller can do about a [`ServiceError`].
@@ -580,6 +431,7 @@ pub const CHECKPOINT_VERSION: u32 = 1;
 /// A checkpoint that cannot be saved or used.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum CheckpointError {
     /// The interval is zero.
     #[error("the interval between checkpoints must be positive")]
@@ -589,92 +441,42 @@ pub enum CheckpointError {
         "checkpoint {} exists; resume from it (`--resume`), move it away, or choose another file",
         path.display()
     )]
-    Exists {
-        /// The file.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
     /// Another engine saves to the file.
     #[error(
         "checkpoint {} is in use by another engine{}; stop it, or choose another file",
         path.display(),
         process.map(|process| format!(" (process {process})")).unwrap_or_default()
     )]
-    InUse {
-        /// The file.
-        path: PathBuf,
-        /// Process id of that engine; `None` if it cannot be read.
-        process: Option<u32>,
-    },
+    InUse { path: PathBuf, process: Option<u32> },
     /// The file cannot be read.
     #[error("checkpoint {} cannot be read: {reason}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
+    Read { path: PathBuf, reason: String },
     /// The file cannot be written. An earlier checkpoint is kept.
     #[error("checkpoint {} cannot be written: {reason}", path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
+    Write { path: PathBuf, reason: String },
     /// The file does not start with `EGYC`.
     #[error("{} is not a checkpoint of an engine", path.display())]
-    NoCheckpoint {
-        /// The file.
-        path: PathBuf,
-    },
+    NoCheckpoint { path: PathBuf },
     /// The checkpoint was saved by a version of this crate with another format.
     #[error(
         "checkpoint {} must be of version {CHECKPOINT_VERSION}, got version {given}; resume with the version of endless-gym that \
          saved it",
         path.display()
     )]
-    Version {
-        /// The file.
-        path: PathBuf,
-        /// The version of the checkpoint.
-        given: u32,
-    },
+    Version { path: PathBuf, given: u32 },
     /// The checksum differs, or the content cannot be decoded.
     #[error("checkpoint {} is damaged: {reason}", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// The checkpoint was saved by an engine with other environments.
     #[error("checkpoint {} was saved with {what} {saved}, and the engine has {given}", path.display())]
-    Mismatch {
-        /// The file.
-        path: PathBuf,
-        /// The property that differs.
-        what: &'static str,
-        /// Its value in the checkpoint.
-        saved: String,
-        /// Its value in the engine's configuration.
-        given: String,
-    },
+    Mismatch { path: PathBuf, what: &'static str, saved: String, given: String },
     /// The state of a group is not valid.
     #[error("checkpoint {}, group {group}: {source}", path.display())]
-    Group {
-        /// The file.
-        path: PathBuf,
-        /// The group.
-        group: usize,
-        /// What is wrong.
-        source: ResumeError,
-    },
+    Group { path: PathBuf, group: usize, source: ResumeError },
     /// The state of an environment cannot be encoded.
     #[error("the environments cannot be saved: {source}")]
-    State {
-        /// Why.
-        source: SnapshotError,
-    },
+    State { source: SnapshotError },
     /// The engine has no file to save to.
     #[error("the engine has no checkpoint file; start it with one (`--checkpoint FILE`)")]
     NoFile,

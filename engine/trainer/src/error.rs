@@ -10,60 +10,33 @@ use thiserror::Error;
 
 /// Why a run did not start, or stopped early.
 #[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum Error {
     /// A setting, or a combination of them, is invalid; the text says what is allowed.
     #[error("{0}")]
     Settings(String),
     /// The environment has actions or observations that the agents do not support.
     #[error("{id} cannot be learnt here: {what}")]
-    Unsupported {
-        /// Environment id.
-        id: String,
-        /// What is missing.
-        what: &'static str,
-    },
+    Unsupported { id: String, what: &'static str },
     /// The folder has no run.
     #[error("no run in {0}; expected a folder with settings.json, as `endless learn` writes it; start a run there with --run {0}", run.display())]
-    NoRun {
-        /// The folder.
-        run: PathBuf,
-    },
+    NoRun { run: PathBuf },
     /// The folder of a new run has another run.
     #[error("{0} already contains a run; continue it with --resume {0}, or choose another folder", run.display())]
-    RunExists {
-        /// The folder.
-        run: PathBuf,
-    },
+    RunExists { run: PathBuf },
     /// Another process trains in the folder.
     #[error("{} is in use by {holder}; wait until it ends, or choose another folder", run.display())]
-    RunInUse {
-        /// The folder.
-        run: PathBuf,
-        /// The other process.
-        holder: String,
-    },
+    RunInUse { run: PathBuf, holder: String },
     /// A checkpoint is missing, damaged, or does not fit.
     #[error("checkpoint {} {what}", path.display())]
-    Checkpoint {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        what: String,
-    },
+    Checkpoint { path: PathBuf, what: String },
     /// The log of a run has no row of an update that its checkpoint contains.
     #[error(
         "{0}/progress.jsonl has no row of update {missing}, and the checkpoint is of update {update}; restore the file, or start a new \
          run with --init-from {0}",
         run.display()
     )]
-    Progress {
-        /// The folder of the run.
-        run: PathBuf,
-        /// The update of the checkpoint.
-        update: u64,
-        /// The first update without a row.
-        missing: u64,
-    },
+    Progress { run: PathBuf, update: u64, missing: u64 },
     /// The loss, the gradient or the weights are no longer finite.
     #[error(
         "update {update} diverged: its {what} is {value}; try a smaller --ppo.learning-rate (now {learning_rate}) or \
@@ -73,53 +46,25 @@ pub enum Error {
     Diverged {
         /// Number of the update, from 1.
         update: u64,
-        /// What is not finite.
         what: &'static str,
-        /// Its value.
         value: f64,
-        /// The learning rate of the update.
         learning_rate: f64,
-        /// The limit of the gradient's norm.
         max_gradient_norm: f64,
-        /// The folder of the run.
         run: PathBuf,
-        /// The update of the last checkpoint.
         saved: u64,
     },
     /// The environments failed, such as an engine that ended. The run is saved.
     #[error("{error}; the run is saved after update {update}; continue with: endless learn --resume {}", run.display())]
-    Saved {
-        /// What failed.
-        error: Box<Error>,
-        /// The update of the checkpoint.
-        update: u64,
-        /// The folder of the run.
-        run: PathBuf,
-    },
+    Saved { error: Box<Error>, update: u64, run: PathBuf },
     /// A file cannot be read or written.
     #[error("{}: {source}", path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Why not.
-        source: io::Error,
-    },
+    File { path: PathBuf, source: io::Error },
     /// A file or a text is not the expected JSON.
     #[error("{what} is not of this version of `endless learn`: {source}")]
-    Json {
-        /// The file.
-        what: String,
-        /// Where it differs.
-        source: serde_json::Error,
-    },
+    Json { what: String, source: serde_json::Error },
     /// The threads cannot be started.
     #[error("cannot start --threads {count}: {source}")]
-    Threads {
-        /// Number of threads.
-        count: usize,
-        /// Why not.
-        source: rayon::ThreadPoolBuildError,
-    },
+    Threads { count: usize, source: rayon::ThreadPoolBuildError },
     /// The environments report an error.
     #[error(transparent)]
     Pool(#[from] PoolError),

@@ -292,55 +292,29 @@ impl<S: SectionTable> TryFrom<LayoutFields> for Layout<S> {
 /// A layout's description is invalid.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum LayoutError {
     /// There are no environments, or too many.
     #[error("num_envs must be 1 to {MAX_ENVS}, got {given}")]
-    NumEnvs {
-        /// The number that was given.
-        given: usize,
-    },
+    NumEnvs { given: usize },
     /// The table has no such section.
     #[error("unknown section `{given}`")]
-    UnknownSection {
-        /// The name that was given.
-        given: String,
-    },
+    UnknownSection { given: String },
     /// A section is given twice.
     #[error("section `{section}` is given twice")]
-    Duplicate {
-        /// The section's name.
-        section: &'static str,
-    },
+    Duplicate { section: &'static str },
     /// A required section is missing.
     #[error("section `{section}` is missing")]
-    Missing {
-        /// The section's name.
-        section: &'static str,
-    },
+    Missing { section: &'static str },
     /// A section's number type differs from the table's.
     #[error("section `{section}` must have dtype {expected}, got {given}")]
-    Dtype {
-        /// The section's name.
-        section: &'static str,
-        /// The number type that was given.
-        given: Dtype,
-        /// The table's number type.
-        expected: Dtype,
-    },
+    Dtype { section: &'static str, given: Dtype, expected: Dtype },
     /// A section's row has the wrong number of dimensions.
     #[error("the row shape of section `{section}` must be {expected}, got {given:?}")]
-    Shape {
-        /// The section's name.
-        section: &'static str,
-        /// The shape that was given.
-        given: Vec<usize>,
-        /// The shapes that are allowed, in words.
-        expected: String,
-    },
+    Shape { section: &'static str, given: Vec<usize>, expected: String },
     /// A section does not start at a multiple of [`BLOCK_BYTES`].
     #[error("the offset of section `{section}` must be a multiple of {BLOCK_BYTES}, got {given}")]
     Alignment {
-        /// The section's name.
         section: &'static str,
         /// The offset that was given, in bytes.
         given: usize,
@@ -348,7 +322,6 @@ pub enum LayoutError {
     /// Sections are not in the order of their offsets.
     #[error("sections must be in the order of their offsets; section `{section}` at byte {given} follows a later one")]
     Order {
-        /// The section's name.
         section: &'static str,
         /// The offset that was given, in bytes.
         given: usize,
@@ -356,7 +329,6 @@ pub enum LayoutError {
     /// A section starts before the previous one ends.
     #[error("section `{section}` overlaps the one before it: it must start at byte {end} or later, got {given}")]
     Overlap {
-        /// The section's name.
         section: &'static str,
         /// The offset that was given, in bytes.
         given: usize,
@@ -365,38 +337,21 @@ pub enum LayoutError {
     },
     /// A section's end does not fit into the address space.
     #[error("section `{section}` is too large for the address space")]
-    TooLarge {
-        /// The section's name.
-        section: &'static str,
-    },
+    TooLarge { section: &'static str },
     /// A section of bytes is too short for the longest content.
     #[error("section `{section}` must have at least {needed} bytes, got {given}")]
-    TooShort {
-        /// The section's name.
-        section: &'static str,
-        /// Bytes of all rows.
-        given: usize,
-        /// Bytes of the longest content.
-        needed: usize,
-    },
+    TooShort { section: &'static str, given: usize, needed: usize },
     /// A section extends beyond the declared size.
     #[error("section `{section}` ends at byte {end}, beyond the declared {blocks} blocks of {BLOCK_BYTES} bytes")]
     PastEnd {
-        /// The section's name.
         section: &'static str,
         /// End of the section, in bytes.
         end: usize,
-        /// The declared size in blocks.
         blocks: usize,
     },
     /// The declared size differs from the size of the sections.
     #[error("blocks must be {expected}, the size of all sections, got {given}")]
-    Blocks {
-        /// The declared size.
-        given: usize,
-        /// The sections' size.
-        expected: usize,
-    },
+    Blocks { given: usize, expected: usize },
 }
 
 #[cfg(test)]

@@ -196,30 +196,17 @@ pub struct InvalidActionSpace {
 /// There are too few or too many actions, or one is out of range.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum ActionError {
     /// Too few or too many numbers.
     #[error(
         "actions must be a row of length {width} for each of {num_envs} environments, {} numbers in all, got {given}",
         num_envs.saturating_mul(*width)
     )]
-    Count {
-        /// The length that was given.
-        given: usize,
-        /// Number of environments.
-        num_envs: usize,
-        /// Number of numbers in an action.
-        width: usize,
-    },
+    Count { given: usize, num_envs: usize, width: usize },
     /// A number is out of its branch's range, or not a number.
     #[error("the action of environment {env} must be in {space}, got {given}")]
-    Range {
-        /// Number of the first environment with such an action.
-        env: usize,
-        /// Its action.
-        given: String,
-        /// The action space.
-        space: String,
-    },
+    Range { env: usize, given: String, space: String },
 }
 
 #[cfg(test)]

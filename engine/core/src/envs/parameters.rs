@@ -232,13 +232,12 @@ impl ResetParameters {
 /// An invalid reset parameter.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum ParameterError {
     /// The environment has no reset parameter with this name.
     #[error("{id} has no reset parameter `{name}`; it has {allowed}")]
     Unknown {
-        /// The environment's id.
         id: &'static str,
-        /// The given name.
         name: String,
         /// The environment's reset parameters, separated by commas.
         allowed: String,
@@ -246,9 +245,7 @@ pub enum ParameterError {
     /// The value has the wrong type.
     #[error("reset parameter `{name}` must be {allowed}, got {value}")]
     WrongType {
-        /// The parameter's name.
         name: &'static str,
-        /// The given value as JSON.
         value: String,
         /// Allowed type and range as text.
         allowed: String,
@@ -256,9 +253,7 @@ pub enum ParameterError {
     /// The value has the right type but is out of range.
     #[error("reset parameter `{name}` must be {allowed}, got {value}")]
     OutOfRange {
-        /// The parameter's name.
         name: &'static str,
-        /// The given value as JSON.
         value: String,
         /// Allowed type and range as text.
         allowed: String,

@@ -15,6 +15,7 @@ use crate::random::EntropyError;
 /// Except for [`PoolError::WrongFrame`] and [`PoolError::Panic`], an error changes no environment and no batch.
 #[derive(Debug, Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum PoolError {
     /// The registry has no environment with this id.
     #[error(transparent)]
@@ -30,41 +31,22 @@ pub enum PoolError {
     ParametersOf {
         /// Number of the environment, counted over all pools.
         env: usize,
-        /// What is wrong with its parameters.
         source: ParameterError,
     },
     /// The number of sets of reset parameters differs from the number of environments.
     #[error("options must be one set for all environments or {num_envs} sets, one for each, got {given} sets")]
-    OptionsCount {
-        /// Number of sets that were given.
-        given: usize,
-        /// Number of environments in the pool.
-        num_envs: usize,
-    },
+    OptionsCount { given: usize, num_envs: usize },
     /// There are no environments, or too many.
     #[error("num_envs must be 1 to {MAX_ENVS}, got {given}")]
-    NumEnvs {
-        /// The number that was given.
-        given: usize,
-    },
+    NumEnvs { given: usize },
     /// `total_envs` is less than `first_env + num_envs`, or too large.
     #[error(
         "total_envs must be first_env + num_envs to {MAX_TOTAL_ENVS}, got {total_envs} with first_env {first_env} and num_envs {num_envs}"
     )]
-    EnvNumbers {
-        /// Number of the pool's first environment.
-        first_env: usize,
-        /// Number of environments in the pool.
-        num_envs: usize,
-        /// Number of environments in all pools together.
-        total_envs: usize,
-    },
+    EnvNumbers { first_env: usize, num_envs: usize, total_envs: usize },
     /// An observation has no frame, or too many.
     #[error("frame stack must be 1 to {MAX_STACK}, got {given}")]
-    Stack {
-        /// The number of frames that was given.
-        given: usize,
-    },
+    Stack { given: usize },
     /// The pool's batch would not fit into the address space.
     #[error(transparent)]
     Layout(#[from] LayoutError),
@@ -74,7 +56,6 @@ pub enum PoolError {
     /// The range of seeds is empty or too large.
     #[error("the range of seeds must not be empty and must end at 2^63 - 1 or lower, got {start}..{end}")]
     SeedRange {
-        /// The first seed.
         start: u64,
         /// The end of the range, excluded.
         end: u64,
@@ -84,16 +65,12 @@ pub enum PoolError {
     SeedStep,
     /// The number of threads is out of range.
     #[error("threads must be 0 (one for each core) to {MAX_THREADS}, got {given}")]
-    ThreadCount {
-        /// The number that was given.
-        given: usize,
-    },
+    ThreadCount { given: usize },
     /// The operating system refuses to start a thread.
     #[error("cannot start {count} threads: {source}")]
     Threads {
         /// Number of threads, the calling one included.
         count: usize,
-        /// The operating system's error.
         source: std::io::Error,
     },
     /// There are fewer CPUs than threads to bind to them.
@@ -108,10 +85,7 @@ pub enum PoolError {
     },
     /// A thread cannot be bound to a CPU.
     #[error("threads cannot be pinned: {source}")]
-    Pin {
-        /// The operating system's error.
-        source: std::io::Error,
-    },
+    Pin { source: std::io::Error },
     /// A call that needs running episodes came before the first reset of all environments.
     #[error("all environments must be reset before any other call")]
     NotReset,
@@ -120,34 +94,16 @@ pub enum PoolError {
     Action(#[from] ActionError),
     /// A reset request has the wrong length.
     #[error("a reset of single environments must have {num_envs} items, one for each environment, got {given}")]
-    ResetCount {
-        /// Number of items that were given.
-        given: usize,
-        /// Number of environments in the pool.
-        num_envs: usize,
-    },
+    ResetCount { given: usize, num_envs: usize },
     /// The pool has no environment with this number.
     #[error("env must be 0 to {}, got {given}", num_envs - 1)]
-    NoSuchEnv {
-        /// The number that was given.
-        given: usize,
-        /// Number of environments in the pool.
-        num_envs: usize,
-    },
+    NoSuchEnv { given: usize, num_envs: usize },
     /// The environment has neither frames nor pictures, only features.
     #[error("{id} has no frames to show, only features")]
-    NoFrame {
-        /// The environment id.
-        id: &'static str,
-    },
+    NoFrame { id: &'static str },
     /// Only RGB frames have a luma.
     #[error("grayscale frames are for environments with 3 channels, and {id} has {channels}")]
-    Grayscale {
-        /// The environment id.
-        id: &'static str,
-        /// Its number of channels.
-        channels: usize,
-    },
+    Grayscale { id: &'static str, channels: usize },
     /// Only with [`check_drawing`](super::PoolConfig::check_drawing): an updated frame differs from the same frame drawn in
     /// full.
     ///
@@ -161,10 +117,5 @@ pub enum PoolError {
     Panic(#[from] EnvPanic),
     /// The memory for a batch is too small.
     #[error("a batch must have at least {needed} blocks of {BLOCK_BYTES} bytes, got {given}")]
-    BatchTooShort {
-        /// Number of blocks that were given.
-        given: usize,
-        /// Number of blocks that the layout needs.
-        needed: usize,
-    },
+    BatchTooShort { given: usize, needed: usize },
 }

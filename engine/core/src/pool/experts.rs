@@ -90,6 +90,7 @@ impl Experts {
 /// Experts cannot be created, or cannot play a batch.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum ExpertsError {
     /// The registry does not have the id.
     #[error(transparent)]
@@ -99,20 +100,8 @@ pub enum ExpertsError {
     NoExpert(#[from] NoExpert),
     /// The batch has no features, or belongs to another id or another number of environments.
     #[error("experts need a batch with the {needed} features of {num_envs} environments, got {given} features")]
-    Features {
-        /// Features that the batch has.
-        given: usize,
-        /// Features that the experts read.
-        needed: usize,
-        /// Number of environments that the experts play.
-        num_envs: usize,
-    },
+    Features { given: usize, needed: usize, num_envs: usize },
     /// Memory for the actions has the wrong length.
     #[error("the actions of the experts are {needed} numbers, got memory for {given}")]
-    Actions {
-        /// Length of the memory.
-        given: usize,
-        /// Numbers that the experts write.
-        needed: usize,
-    },
+    Actions { given: usize, needed: usize },
 }

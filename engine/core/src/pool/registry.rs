@@ -151,37 +151,20 @@ impl<E: Environment + 'static> AnyFamily for Family<E> {
 /// The registry refuses an environment.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum RegistryError {
     /// Two environments have the same id.
     #[error("the registry already has an environment `{id}`")]
-    Duplicate {
-        /// The id.
-        id: &'static str,
-    },
+    Duplicate { id: &'static str },
     /// The size of the frame is out of range.
     #[error("frames must have a width and height of 1 to {max} and 1, 3 or 4 channels, got {given:?} for `{id}`", max = FrameShape::MAX_SIDE)]
-    Frame {
-        /// The id.
-        id: &'static str,
-        /// Its frame.
-        given: FrameShape,
-    },
+    Frame { id: &'static str, given: FrameShape },
     /// The environment has neither a frame nor features.
     #[error("an environment must have a frame or features, and `{id}` has neither")]
-    NoObservation {
-        /// The id.
-        id: &'static str,
-    },
+    NoObservation { id: &'static str },
     /// The observation space does not fit the features.
     #[error("the observation space of `{id}` must have as many numbers as there are features, {features}, got {given}")]
-    ObservationSpace {
-        /// The id.
-        id: &'static str,
-        /// Numbers of the space.
-        given: usize,
-        /// Number of features.
-        features: usize,
-    },
+    ObservationSpace { id: &'static str, given: usize, features: usize },
 }
 
 /// An id without a scripted expert.

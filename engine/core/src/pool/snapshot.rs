@@ -74,15 +74,11 @@ impl<S: DeserializeOwned> Saved<S> {
 /// A snapshot cannot be taken or restored. Except for [`SnapshotError::Panic`], the environment has not changed.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum SnapshotError {
     /// The pool has no environment with this number.
     #[error("env must be 0 to {}, got {given}", num_envs - 1)]
-    NoSuchEnv {
-        /// The number that was given.
-        given: usize,
-        /// Number of environments in the pool.
-        num_envs: usize,
-    },
+    NoSuchEnv { given: usize, num_envs: usize },
     /// The environments have no state before their first reset.
     #[error("all environments must be reset before a snapshot is taken or restored")]
     NotReset,
@@ -91,10 +87,7 @@ pub enum SnapshotError {
     NoSnapshot,
     /// The snapshot was taken by a version of this crate with another snapshot format.
     #[error("the snapshot must be of version {SNAPSHOT_VERSION}, got version {given}; take it again")]
-    Version {
-        /// The snapshot's version.
-        given: u32,
-    },
+    Version { given: u32 },
     /// The checksum differs.
     #[error("the snapshot is damaged: its checksum differs")]
     Damaged,
@@ -103,20 +96,10 @@ pub enum SnapshotError {
     Content(String),
     /// The snapshot belongs to another environment id.
     #[error("the snapshot must be of {expected}, got {given}")]
-    OtherEnvironment {
-        /// The snapshot's environment id.
-        given: String,
-        /// The pool's environment id.
-        expected: &'static str,
-    },
+    OtherEnvironment { given: String, expected: &'static str },
     /// The earlier frames of a stacked observation, which a checkpoint stores beside the snapshot, have the wrong length.
     #[error("the earlier frames must have {expected} bytes, got {given}")]
-    EarlierFrames {
-        /// Bytes that were given.
-        given: usize,
-        /// Bytes that the pool's observation needs.
-        expected: usize,
-    },
+    EarlierFrames { given: usize, expected: usize },
     /// The snapshot's reset parameters are invalid.
     #[error("the snapshot's reset parameters: {0}")]
     Parameters(#[from] ParameterError),
@@ -142,21 +125,12 @@ pub struct SavedEnv {
 /// A pool cannot continue from a saved state.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum ResumeError {
     /// The number of environments differs.
     #[error("the saved state must have {num_envs} environments, got {given}")]
-    Count {
-        /// Saved environments.
-        given: usize,
-        /// Environments of the pool.
-        num_envs: usize,
-    },
+    Count { given: usize, num_envs: usize },
     /// The state of an environment is invalid.
     #[error("environment {env}: {source}")]
-    Environment {
-        /// Number of the environment in its pool.
-        env: usize,
-        /// What is wrong.
-        source: SnapshotError,
-    },
+    Environment { env: usize, source: SnapshotError },
 }

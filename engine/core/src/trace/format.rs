@@ -180,6 +180,7 @@ impl Trace {
 /// A trace cannot be read or replayed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the messages say what most fields are")]
 pub enum TraceError {
     /// The file cannot be opened.
     #[error("the trace cannot be opened: {0}")]
@@ -201,9 +202,7 @@ pub enum TraceError {
     Truncated {
         /// Episode of the trace, from 0.
         episode: usize,
-        /// Number of its steps.
         steps: usize,
-        /// Number of steps after which a recording stops.
         max_steps: usize,
     },
     /// The environment does not exist, or the recorded reset parameters or actions are invalid.

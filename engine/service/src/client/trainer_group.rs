@@ -55,7 +55,7 @@ impl Shared {
 /// One group of a [`Trainer`](crate::Trainer), which another thread can step at the same time as the others.
 ///
 /// [`Trainer::groups`](crate::Trainer::groups) lends the groups, and [`Trainer::into_groups`](crate::Trainer::into_groups)
-/// returns them. The methods are those of the trainer, without a group's number.
+/// returns them. The methods and their errors are those of the trainer, without a group's number.
 ///
 /// ```no_run
 /// use std::time::Duration;
@@ -107,6 +107,7 @@ fn are_of_one_trainer(groups: &[impl Borrow<TrainerGroup>]) -> bool {
     groups.iter().all(|group| Arc::ptr_eq(&group.borrow().shared, &groups[0].borrow().shared))
 }
 
+#[expect(clippy::missing_errors_doc, reason = "those of the trainer's methods of the same name")]
 impl TrainerGroup {
     pub(super) fn new(number: usize, last_request: u64, shared: &Arc<Shared>) -> Self {
         let (pending, shared) = (PendingRequest::NONE, Arc::clone(shared));
@@ -124,19 +125,11 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::reset`](crate::Trainer::reset).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::reset`](crate::Trainer::reset), except for a wrong number of the group.
     pub fn reset(&mut self, request: ResetRequest<'_>) -> Result<(), ServiceError> {
         self.reset_with(request, None)
     }
 
     /// See [`Trainer::reset_with`](crate::Trainer::reset_with).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::reset_with`](crate::Trainer::reset_with), except for a wrong number of the group.
     pub fn reset_with(
         &mut self,
         request: ResetRequest<'_>,
@@ -172,10 +165,6 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::send`](crate::Trainer::send).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::send`](crate::Trainer::send), except for a wrong number of the group.
     pub fn send(&mut self, actions: &[i32]) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.shared.specification);
         // Order of the checks: number of actions, pending answer, range.
@@ -191,10 +180,6 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::send_with`](crate::Trainer::send_with).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::send_with`](crate::Trainer::send_with), except for a wrong number of the group.
     pub fn send_with(&mut self, fill: impl FnOnce(&mut [i32])) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.shared.specification);
         self.post(Request::new(RequestKind::Step), |message| {
@@ -206,10 +191,6 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::receive`](crate::Trainer::receive).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::receive`](crate::Trainer::receive), except for a wrong number of the group.
     pub fn receive(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         if !self.pending.has_batch() {
             return Err(ServiceError::NothingSent { group: self.number });
@@ -230,10 +211,6 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::set_options`](crate::Trainer::set_options).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::set_options`](crate::Trainer::set_options), except for a wrong number of the group.
     pub fn set_options(&mut self, sets: &[NextOptions], timeout: Duration) -> Result<(), ServiceError> {
         for text in messages(sets)? {
             self.transfer_bytes(Request::new(RequestKind::SetOptions), &text, timeout)?;
@@ -242,10 +219,6 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::running_episodes`](crate::Trainer::running_episodes).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::running_episodes`](crate::Trainer::running_episodes), except for a wrong number of the group.
     pub fn running_episodes(&mut self, envs: &[usize], timeout: Duration) -> Result<Vec<RunningEpisode>, ServiceError> {
         let num_envs = self.shared.specification.num_envs;
         let mut missing: BTreeSet<usize> = envs.iter().copied().collect();
@@ -278,19 +251,11 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::snapshot`](crate::Trainer::snapshot).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::snapshot`](crate::Trainer::snapshot), except for a wrong number of the group.
     pub fn snapshot(&mut self, env: usize, timeout: Duration) -> Result<Vec<u8>, ServiceError> {
         self.transfer(Request { env, ..Request::new(RequestKind::Snapshot) }, timeout, |_| Ok(0))
     }
 
     /// See [`Trainer::restore`](crate::Trainer::restore).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::restore`](crate::Trainer::restore), except for a wrong number of the group.
     pub fn restore(&mut self, env: usize, snapshot: &[u8], timeout: Duration) -> Result<(), ServiceError> {
         let given = snapshot.len();
         if given > SNAPSHOT_BYTES {
@@ -300,10 +265,6 @@ impl TrainerGroup {
     }
 
     /// See [`Trainer::checkpoint`](crate::Trainer::checkpoint).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`Trainer::checkpoint`](crate::Trainer::checkpoint), except for a wrong number of the group.
     pub fn checkpoint(&mut self, timeout: Duration) -> Result<Vec<u64>, ServiceError> {
         let steps = self.transfer(Request::new(RequestKind::Checkpoint), timeout, |_| Ok(0))?;
         Ok(steps.chunks_exact(size_of::<u64>()).map(bytemuck::pod_read_unaligned).collect())
