@@ -46,41 +46,21 @@ impl Outcome {
         }
     }
 
-    /// The summary as JSON.
-    pub fn json(&self, seed: u64, rounds: u64) -> serde_json::Value {
-        serde_json::json!({
-            "seed": seed,
-            "rounds": rounds,
-            "faults": self.faults.len(),
-            "batches_compared": self.batches,
-            "observed_batches_compared": self.observed,
-            "recovery_ms_median_max": recovery(self.faults.iter().filter_map(|(_, time)| *time)),
-            "kinds": self.kinds().into_iter().map(|(kind, times)| {
-                (kind, serde_json::json!({"faults": times.len(), "recovery_ms_median_max": recovery(times.into_iter().flatten())}))
-            }).collect::<serde_json::Map<_, _>>(),
-            "failures": self.failures,
-            "errors": self.errors,
-            "left_out": self.left_out,
-        })
-    }
-
-    fn kinds(&self) -> BTreeMap<String, Vec<Option<f64>>> {
-        let mut kinds = BTreeMap::<_, Vec<_>>::new();
-        for (kind, time) in &self.faults {
-            kinds.entry(kind.clone()).or_default().push(*time);
-        }
-        kinds
-    }
-
     /// Prints the summary.
     pub fn print(&self) {
         println!("\n{:34} {:>7} {:>9} {:>9}  recovery in milliseconds", "fault", "faults", "median", "max");
-        let all = ("all".to_owned(), self.faults.iter().map(|(_, time)| *time).collect());
-        for (kind, times) in self.kinds().into_iter().chain([all]) {
+        let mut kinds = BTreeMap::<_, Vec<_>>::new();
+        for (kind, time) in &self.faults {
+            kinds.entry(kind.as_str()).or_default().push(*time);
+        }
+        let all = ("all", self.faults.iter().map(|(_, time)| *time).collect());
+        for (kind, times) in kinds.into_iter().chain([all]) {
             let count = times.len();
-            match recovery(times.into_iter().flatten()) {
-                Some([median, max]) => println!("{kind:34} {count:>7} {median:>9.0} {max:>9.0}"),
-                None => println!("{kind:34} {count:>7}"),
+            let mut times: Vec<f64> = times.into_iter().flatten().collect();
+            times.sort_by(f64::total_cmp);
+            match (times.get(times.len() / 2), times.last()) {
+                (Some(median), Some(max)) => println!("{kind:34} {count:>7} {median:>9.0} {max:>9.0}"),
+                _ => println!("{kind:34} {count:>7}"),
             }
         }
         println!("\nbatches compared: {} of trainers, {} of observers", self.batches, self.observed);
@@ -98,11 +78,4 @@ impl Outcome {
         }
         println!("{} faults, {} failures", self.faults.len(), self.failures.len());
     }
-}
-
-/// The median and the maximum of recovery times, in milliseconds.
-fn recovery(times: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
-    let mut times: Vec<f64> = times.collect();
-    times.sort_by(f64::total_cmp);
-    Some([*times.get(times.len() / 2)?, *times.last()?])
 }

@@ -1,6 +1,5 @@
 //! A run: successive rounds, each in a new process and namespace.
 
-use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -35,9 +34,6 @@ pub struct Args {
     /// Play only this round.
     #[arg(long)]
     round: Option<u64>,
-    /// Write the summary as JSON to a file.
-    #[arg(long)]
-    json: Option<PathBuf>,
 }
 
 /// Runs `faults`.
@@ -80,10 +76,6 @@ pub fn run(args: &Args) -> Result<(), String> {
         total.add(outcome);
     }
     total.print();
-    if let Some(path) = &args.json {
-        let text = format!("{:#}\n", total.json(seed, rounds));
-        std::fs::write(path, text).map_err(|error| format!("{}: {error}", path.display()))?;
-    }
     if rounds == 0 {
         return Err("no round was played".to_owned());
     }

@@ -1,9 +1,7 @@
 //! A long run without faults: plays all ids with random options and formats while observers and a page watch, and
 //! measures memory, descriptors and files.
 
-use std::collections::BTreeMap;
 use std::fs;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -11,7 +9,6 @@ use endless_gym::environments;
 use endless_gym_core::random::Generator;
 use endless_gym_service::Namespace;
 use rustix::process::Signal;
-use serde::Serialize;
 
 use crate::actors::{self, Actor};
 use crate::cleanliness;
@@ -45,67 +42,47 @@ pub struct Args {
     /// The seed of options, formats and actions [default: random].
     #[arg(long)]
     seed: Option<u64>,
-    /// Write the summary as JSON to a file.
-    #[arg(long)]
-    json: Option<PathBuf>,
 }
 
-/// The resources that the processes use at one time.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-struct Usage {
-    engine_memory: u64,
-    trainer_memory: u64,
-    page_memory: u64,
-    engine_descriptors: u64,
-    trainer_descriptors: u64,
-    page_descriptors: u64,
-    segments: u64,
-    files: u64,
+/// What is counted, and the growth of it that is not a leak; that of memory depends on the environments.
+const COUNTERS: [(&str, Option<u64>); 8] = [
+    ("memory of the engine", None),
+    ("memory of the trainer", None),
+    ("memory of the page's server", None),
+    ("descriptors of the engine", Some(DESCRIPTORS)),
+    ("descriptors of the trainer", Some(DESCRIPTORS)),
+    ("descriptors of the page's server", Some(DESCRIPTORS)),
+    ("segments", Some(SEGMENTS)),
+    ("files", Some(SEGMENTS)),
+];
+
+/// The counters at one time.
+type Usage = [u64; COUNTERS.len()];
+
+fn usage(scene: &Scene<'_>, page: u32) -> Usage {
+    let id = |actor: &Option<Actor>| actor.as_ref().map_or(0, Actor::id);
+    let processes = [id(&scene.engine), id(&scene.trainer), page];
+    let ([engine, trainer, server], [of_engine, of_trainer, of_server]) =
+        (processes.map(memory), processes.map(descriptors));
+    let files = cleanliness::files(&scene.namespace);
+    let segments = files.iter().filter(|path| path.starts_with("/dev/shm")).count();
+    let files = files.len() - segments;
+    [engine, trainer, server, of_engine, of_trainer, of_server, segments as u64, files as u64]
 }
 
-impl Usage {
-    fn of(scene: &Scene<'_>, page: u32) -> Self {
-        let id = |actor: &Option<Actor>| actor.as_ref().map_or(0, Actor::id);
-        let (engine, trainer) = (id(&scene.engine), id(&scene.trainer));
-        let (segments, files): (Vec<_>, Vec<_>) =
-            cleanliness::files(&scene.namespace).into_iter().partition(|path| path.starts_with("/dev/shm"));
-        Usage {
-            engine_memory: memory(engine),
-            trainer_memory: memory(trainer),
-            page_memory: memory(page),
-            engine_descriptors: descriptors(engine),
-            trainer_descriptors: descriptors(trainer),
-            page_descriptors: descriptors(page),
-            segments: segments.len() as u64,
-            files: files.len() as u64,
-        }
-    }
-
-    /// The resources that have grown during a phase: the lowest value of the last third exceeds the highest of the
-    /// first by more than a limit, which is `memory` bytes for memory. The first two fifths of the phase, in which the
-    /// environments make pictures of their options, are skipped.
-    fn growth(usages: &[Usage], memory: u64) -> Vec<String> {
-        type Counter = (&'static str, fn(&Usage) -> u64, u64);
-
-        let usages = &usages[2 * usages.len() / 5..];
-        let third = usages.len() / 3;
-        let (first, last) = (&usages[..third], &usages[usages.len() - third..]);
-        let counters: [Counter; 8] = [
-            ("memory of the engine", |usage| usage.engine_memory, memory),
-            ("memory of the trainer", |usage| usage.trainer_memory, memory),
-            ("memory of the page's server", |usage| usage.page_memory, memory),
-            ("descriptors of the engine", |usage| usage.engine_descriptors, DESCRIPTORS),
-            ("descriptors of the trainer", |usage| usage.trainer_descriptors, DESCRIPTORS),
-            ("descriptors of the page's server", |usage| usage.page_descriptors, DESCRIPTORS),
-            ("files", |usage| usage.files, SEGMENTS),
-            ("segments", |usage| usage.segments, SEGMENTS),
-        ];
-        let grown = counters.into_iter().filter_map(|(name, counter, limit)| {
-            let (before, after) = (first.iter().map(counter).max()?, last.iter().map(counter).min()?);
-            (after > before + limit).then(|| format!("{name} from at most {before} to at least {after}"))
-        });
-        grown.collect()
-    }
+/// The counters that have grown during a phase: the lowest value of the last third exceeds the highest of the first by more
+/// than the limit, which is `memory` bytes for memory. The first two fifths of the phase, in which the environments make
+/// pictures of their options, are skipped.
+fn growth(usages: &[Usage], memory: u64) -> Vec<String> {
+    let usages = &usages[2 * usages.len() / 5..];
+    let third = usages.len() / 3;
+    let grown = COUNTERS.iter().enumerate().filter_map(|(counter, (name, limit))| {
+        let before = usages[..third].iter().map(|usage| usage[counter]).max()?;
+        let after = usages[usages.len() - third..].iter().map(|usage| usage[counter]).min()?;
+        let limit = limit.unwrap_or(memory);
+        (after > before + limit).then(|| format!("{name} from at most {before} to at least {after}"))
+    });
+    grown.collect()
 }
 
 /// Resident memory of a process in bytes.
@@ -117,16 +94,6 @@ fn memory(process: u32) -> u64 {
 
 fn descriptors(process: u32) -> u64 {
     fs::read_dir(format!("/proc/{process}/fd")).map_or(0, |entries| entries.count() as u64)
-}
-
-/// One id's part of the run.
-#[derive(Debug, Serialize)]
-struct Phase {
-    id: String,
-    steps: u64,
-    first: Usage,
-    last: Usage,
-    outcome: Outcome,
 }
 
 /// Runs `soak`.
@@ -141,7 +108,7 @@ pub fn run(args: &Args) -> Result<(), String> {
     let ids: Vec<&str> = environments().specs().map(|spec| spec.id).collect();
     let mut draws = Generator::from_seed(seed);
     let start = Instant::now();
-    let mut phases: Vec<Phase> = Vec::new();
+    let (mut total, mut steps) = (Outcome::default(), 0);
     for (number, id) in ids.iter().enumerate() {
         if stop.load(Ordering::Relaxed) {
             break;
@@ -159,16 +126,29 @@ pub fn run(args: &Args) -> Result<(), String> {
         };
         let namespace = new_namespace()?;
         let must_end = || start.elapsed() >= end || stop.load(Ordering::Relaxed);
-        let phase = phase(&plan, namespace.clone(), &mut draws, start, must_end);
+        let outcome = phase(&plan, namespace.clone(), &mut draws, start, must_end);
         cleanliness::remove_all(&namespace);
-        let phase = phase?;
-        println!("{id}: {} steps, {} failures", phase.steps, phase.outcome.failures.len());
-        for failure in &phase.outcome.failures {
+        let outcome = outcome?;
+        println!("{id}: {} steps, {} failures", self::steps(&outcome, &plan), outcome.failures.len());
+        for failure in &outcome.failures {
             println!("    FAILED: {}: {}\n    {:?}", failure.kind, failure.text, plan.shape);
         }
-        phases.push(phase);
+        steps += self::steps(&outcome, &plan);
+        total.add(outcome);
     }
-    summary(args, seed, start.elapsed(), &phases)
+    println!(
+        "{steps} steps compared in {:.1} minutes, {} messages shown",
+        start.elapsed().as_secs_f64() / 60.0,
+        total.shown
+    );
+    end(&total, seed)
+}
+
+/// Prints the sums of a run. Failures are its error.
+fn end(total: &Outcome, seed: u64) -> Result<(), String> {
+    let failures = total.failures.len();
+    println!("{} batches of trainers and {} of observers compared, {failures} failures", total.batches, total.observed);
+    if failures == 0 { Ok(()) } else { Err(format!("{failures} failures; seed {seed}")) }
 }
 
 /// Starts and stops engines and trainers in one namespace. Nothing of them may be left, and this process must not grow.
@@ -230,8 +210,7 @@ fn starts(count: u64, seed: u64, stop: &AtomicBool) -> Result<(), String> {
     if after.0 > before.0 + OWN_MEMORY || after.1 > before.1 {
         return Err(format!("memory and descriptors have grown from {before:?} to {after:?}; seed {seed}"));
     }
-    println!("{} batches compared, {} failures", total.batches, total.failures.len());
-    if total.failures.is_empty() { Ok(()) } else { Err(format!("{} failures; seed {seed}", total.failures.len())) }
+    end(&total, seed)
 }
 
 fn phase(
@@ -240,7 +219,7 @@ fn phase(
     draws: &mut Generator,
     start: Instant,
     must_end: impl Fn() -> bool,
-) -> Result<Phase, String> {
+) -> Result<Outcome, String> {
     let mut scene = Scene::new(plan, namespace);
     for role in [Role::Engine, Role::Trainer, Role::Observer] {
         scene.start(role)?;
@@ -254,7 +233,7 @@ fn phase(
     let mut next_observer = Instant::now();
     while !must_end() {
         scene.watch(Duration::from_millis(500))?;
-        usages.push(Usage::of(&scene, page_id));
+        usages.push(usage(&scene, page_id));
         if Instant::now() >= next_observer {
             // Observers end regularly or are killed.
             if draws.integers(0, 2) == 0 {
@@ -265,11 +244,14 @@ fn phase(
             scene.start(Role::Observer)?;
             next_observer = Instant::now() + Duration::from_millis(draws.integers(500, 8000) as u64);
         }
-        if start.elapsed().as_secs() / 60 > minute
-            && let Some(usage) = usages.last()
-        {
-            minute = start.elapsed().as_secs() / 60;
-            print_minute(minute, &scene, plan, *usage);
+        if start.elapsed().as_secs() / 60 > minute {
+            minute += 1;
+            let failures = scene.outcome.failures.len();
+            println!("minute {minute}: {}: {} steps, {failures} failures", plan.shape.id, steps(&scene.outcome, plan));
+            println!(
+                "    {:?}",
+                COUNTERS.iter().map(|(name, _)| name).zip(usages.last().into_iter().flatten()).collect::<Vec<_>>()
+            );
         }
     }
     // A very short run is not judged, since its processes are still starting.
@@ -277,7 +259,7 @@ fn phase(
         let shape = &plan.shape;
         let dark = if shape.id.contains("SearingSpotlights") { DARK_PICTURES } else { 0 };
         let memory = MEMORY + dark * (shape.groups * shape.num_envs) as u64;
-        for grown in Usage::growth(&usages, memory) {
+        for grown in growth(&usages, memory) {
             scene.fail("growth", grown);
         }
     }
@@ -296,62 +278,9 @@ fn phase(
     if scene.outcome.shown == 0 {
         scene.fail("no messages", "the page has shown nothing".to_owned());
     }
-    Ok(Phase {
-        id: plan.shape.id.clone(),
-        steps: steps(&scene.outcome, plan),
-        first: usages.get(usages.len() / 10).copied().unwrap_or_default(),
-        last: usages.last().copied().unwrap_or_default(),
-        outcome: std::mem::take(&mut scene.outcome),
-    })
+    Ok(std::mem::take(&mut scene.outcome))
 }
 
 fn steps(outcome: &Outcome, plan: &Plan) -> u64 {
     outcome.batches * plan.shape.num_envs as u64
-}
-
-fn print_minute(minute: u64, scene: &Scene<'_>, plan: &Plan, usage: Usage) {
-    println!(
-        "minute {minute}: {}: {} steps, {} failures; of engine, trainer and page: memory {:.1}, {:.1} and {:.1} MB, \
-         descriptors {}, {} and {}; {} segments, {} files",
-        plan.shape.id,
-        steps(&scene.outcome, plan),
-        scene.outcome.failures.len(),
-        usage.engine_memory as f64 / 1e6,
-        usage.trainer_memory as f64 / 1e6,
-        usage.page_memory as f64 / 1e6,
-        usage.engine_descriptors,
-        usage.trainer_descriptors,
-        usage.page_descriptors,
-        usage.segments,
-        usage.files,
-    );
-}
-
-fn summary(args: &Args, seed: u64, time: Duration, phases: &[Phase]) -> Result<(), String> {
-    let steps: u64 = phases.iter().map(|phase| phase.steps).sum();
-    let observed: u64 = phases.iter().map(|phase| phase.outcome.observed).sum();
-    let shown: u64 = phases.iter().map(|phase| phase.outcome.shown).sum();
-    let failures: usize = phases.iter().map(|phase| phase.outcome.failures.len()).sum();
-    let mut kinds = BTreeMap::<_, u64>::new();
-    for failure in phases.iter().flat_map(|phase| &phase.outcome.failures) {
-        *kinds.entry(&failure.kind).or_default() += 1;
-    }
-    println!(
-        "\n{steps} steps compared in {:.1} minutes, {observed} batches of observers compared, {shown} messages of \
-         pages shown",
-        time.as_secs_f64() / 60.0
-    );
-    for (kind, count) in &kinds {
-        println!("FAILED {count} times: {kind}");
-    }
-    println!("{failures} failures");
-    if let Some(path) = &args.json {
-        let minutes = time.as_secs_f64() / 60.0;
-        let summary = serde_json::json!({
-            "seed": seed, "minutes": minutes, "steps": steps, "observed_batches_compared": observed, "messages_shown": shown, "failures": failures,
-            "phases": phases,
-        });
-        fs::write(path, format!("{summary:#}\n")).map_err(|error| format!("{}: {error}", path.display()))?;
-    }
-    if failures == 0 { Ok(()) } else { Err(format!("{failures} failures; seed {seed}")) }
 }
