@@ -1,10 +1,14 @@
 """Checks an installed package: imports it, and steps an environment in this process and in an engine's."""
 
 import importlib.metadata
+import os
 import platform
 import subprocess
 import sys
+import time
+import urllib.error
 import urllib.request
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -47,14 +51,32 @@ with endless_gym.serve(ENV, num_envs=4) as served:
 if rewards != served_rewards or not np.array_equal(frames, served_frames) or frames.std() == 0:
     sys.exit("an engine process and this process must give the same frames and rewards")
 if sys.argv[2] == "page":
-    with subprocess.Popen([f"{sys.prefix}/bin/endless", "play", ENV], stdout=subprocess.PIPE, text=True) as server:
+    browser = Path("browser")
+    browser.write_text('#!/bin/sh\necho "$1" > opened.part; mv opened.part opened\n')
+    browser.chmod(0o700)
+    episode = ["SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]"]
+    with subprocess.Popen(
+        [f"{sys.prefix}/bin/endless", "play", *episode, "--open"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"BROWSER": str(browser.absolute())},
+    ) as server:
         assert server.stdout is not None
-        address = server.stdout.readline().split()[-1].partition("#")[0]
+        url = server.stdout.readline().split()[-1]
+        address, _, link = url.partition("#")
         with urllib.request.urlopen(f"{address}engine.wasm") as answer:
-            is_page = answer.read(4) == b"\0asm"
+            is_page = answer.read(4) == b"\0asm" and link == "env=SearingSpotlights-v0&seed=9&num_coins=%5B3%5D"
+        for header in ({"Host": "example.org"}, {"Origin": "http://example.org"}):
+            try:
+                urllib.request.urlopen(urllib.request.Request(address, headers=header))
+                is_page = False
+            except urllib.error.HTTPError as refused:
+                is_page &= refused.code == 403
         server.terminate()
-    if not is_page or server.returncode:
-        sys.exit(f"`endless play` must serve the page and end with status 0, got {server.returncode}")
+    while not Path("opened").exists():
+        time.sleep(0.01)
+    if not is_page or server.returncode or Path("opened").read_text() != f"{url}\n":
+        sys.exit(f"`endless play --open` must serve the page and open it, got {url} and status {server.returncode}")
     command = [f"{sys.prefix}/bin/endless", "play", "popgym-RepeatFirstEasy-v0"]
     refused = subprocess.run(command, capture_output=True, text=True, timeout=60)
     if refused.returncode != 1 or "is not on the page" not in refused.stderr:

@@ -177,9 +177,6 @@ pub fn test() -> Result<(), String> {
     build()?;
     let wheel = only_file(&folder()?, ".whl")?;
     let page = if web::Toolchain::find().is_some() { "page" } else { "no page" };
-    if page == "page" {
-        run(&mut cargo(&["test", "--locked", "--release", "--test", "integration", "play_page::"]))?;
-    }
     let mut oldest = None;
     for minor in python::SUPPORTED {
         let Some(python) = python::interpreter(minor) else {

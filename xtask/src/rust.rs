@@ -38,12 +38,10 @@ pub fn test() -> Result<(), String> {
     cargo(&["test", "--workspace", "--locked", "--no-fail-fast"])
 }
 
-/// The ignored tests (slow ones, and those that the machine may forbid), except those that need a browser or the
-/// original, or only measure.
+/// The ignored tests (slow ones, and those that the machine may forbid), except those that need a browser or the original.
 pub fn test_ignored() -> Result<(), String> {
-    let all = "test --workspace --locked --no-fail-fast --lib --tests --exclude endless-gym-web -- --ignored";
-    let mut arguments = Vec::from_iter(all.split(' '));
-    arguments.extend("--skip browser:: --skip live:: --skip measure".split(' '));
+    let all = "test --workspace --locked --no-fail-fast --lib --tests --exclude endless-gym-web --";
+    let mut arguments = Vec::from_iter(all.split(' ').chain("--ignored --skip browser:: --skip live::".split(' ')));
     if !succeeds(Command::new("unshare").args(["--mount", "--map-root-user", "true"])) {
         not_run("without permission to create mount namespaces: tests in shared memory of other sizes")?;
         let skipped = ["inside_", "two_directories_of_one_path", "too_little_shared_memory"];

@@ -127,8 +127,7 @@ pub fn test() -> Result<(), String> {
     build()?;
     build_own()?;
     install()?;
-    // Skip tests that only measure or make pictures.
-    let tests = ["--ignored", "--test-threads", "1", "--skip", "measure"];
+    let tests = ["--ignored", "--test-threads", "1"];
     // Of the whole workspace, since packages that are selected alone are compiled again with fewer features.
     run(cargo(&["test", "--workspace", "--locked", "--test", "browser", "--"]).args(tests))?;
     run(cargo(&["test", "--workspace", "--locked", "--test", "integration", "--"]).args(tests).arg("browser::"))
