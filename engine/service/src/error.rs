@@ -484,26 +484,3 @@ pub enum CheckpointError {
     #[error("there is nothing to save before the first reset")]
     NotReset,
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_rejection_has_its_own_status() {
-        for rejection in Rejection::ALL {
-            assert_eq!(Rejection::from_status(rejection.status()), Some(rejection));
-        }
-        assert_eq!(Rejection::from_status(0), None);
-        assert_eq!(Rejection::from_status(99), None);
-    }
-
-    #[test]
-    fn messages_name_both_versions() {
-        let text =
-            ServiceError::Version { service: "a".into(), layout: "5".into(), package: "9.9.9".into() }.to_string();
-        for part in ["got 5", "9.9.9", &format!("layout version {LAYOUT_VERSION}"), PACKAGE_VERSION] {
-            assert!(text.contains(part), "{text}");
-        }
-    }
-}

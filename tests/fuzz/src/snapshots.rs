@@ -108,10 +108,6 @@ pub struct Game {
 
 impl Game {
     /// Creates an environment and resets it.
-    ///
-    /// # Panics
-    ///
-    /// If the options are not valid.
     pub fn new(spec: &'static EnvSpec, seeding: Seeding, options: Map<String, Json>) -> Self {
         let config = PoolConfig::new(spec.id, 1)
             .seeding(seeding)
@@ -127,10 +123,6 @@ impl Game {
     }
 
     /// Plays random actions.
-    ///
-    /// # Panics
-    ///
-    /// If a step fails.
     pub fn play(&mut self, steps: usize) {
         for _ in 0..steps {
             let action = self.spec.action_space.sample(&mut self.random);
@@ -139,10 +131,6 @@ impl Game {
     }
 
     /// The decoded content of a snapshot.
-    ///
-    /// # Panics
-    ///
-    /// If the format differs from this file's description.
     pub fn content(&mut self) -> Value {
         let snapshot = self.snapshot();
         self.head.copy_from_slice(&snapshot[..HEAD]);
@@ -188,10 +176,6 @@ impl Game {
     }
 
     /// A snapshot.
-    ///
-    /// # Panics
-    ///
-    /// Never: the environment was reset.
     pub fn snapshot(&self) -> Vec<u8> {
         self.pool.snapshot(0).unwrap()
     }
@@ -249,10 +233,6 @@ fn children(value: &mut Value) -> Vec<&mut Value> {
 }
 
 /// The value at `path`.
-///
-/// # Panics
-///
-/// If there is no value at `path`.
 pub fn at<'a>(value: &'a mut Value, path: &[usize]) -> &'a mut Value {
     match path.split_first() {
         Some((index, rest)) => at(children(value).swap_remove(*index), rest),
@@ -280,10 +260,6 @@ pub fn paths(value: &mut Value) -> Vec<Path> {
 }
 
 /// Values to replace any number or list.
-///
-/// # Panics
-///
-/// Never: the numbers are in range.
 pub fn extremes() -> Vec<Value> {
     // Near zero, at the limits of types, and at the limits of coordinates and counters.
     let bounds = [1 << 8, 1 << 13, 1 << 15, 1 << 28, 1 << 31, 1 << 32, 1 << 62, 1 << 63, 1 << 64_i128];
@@ -296,8 +272,7 @@ pub fn extremes() -> Vec<Value> {
     integers.chain(floats.into_iter().map(Value::Float)).chain(others).collect()
 }
 
-/// Plays a snapshot in which some numbers, or some bytes, are replaced.
-/// The target.
+/// The target: plays a snapshot in which some numbers, or some bytes, are replaced.
 pub fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
     let spec = playing::spec(input)?;
     let seeding = match input.int_in_range(0..=2)? {

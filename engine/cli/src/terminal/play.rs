@@ -238,34 +238,6 @@ mod tests {
         Player::new(game, Keys::new(Duration::ZERO), Duration::from_millis(1))
     }
 
-    fn length(player: &Player) -> String {
-        player.game.numbers()
-    }
-
-    #[test]
-    fn commands_play_and_restart() {
-        let mut player = player("MysteryPath-Grid-v0");
-        let start = player.game.frame().pixels;
-        assert!(!player.is_running() && player.lines().unwrap()[1].starts_with("waits for the first key"));
-        player.carry_out(Command::Move(&[Direction::Left])).unwrap();
-        assert!(player.is_running() && length(&player).contains("step 0"));
-        player.step(Instant::now()).unwrap();
-        assert!(length(&player).contains("seed 3  step 1"));
-        assert!(player.game.frame().pixels != start, "it has turned");
-        player.carry_out(Command::OneStep).unwrap();
-        player.carry_out(Command::Move(&[Direction::Up])).unwrap();
-        assert!(
-            player.clock == Clock::Paused && length(&player).contains("step 3"),
-            "a paused game plays single steps"
-        );
-        player.carry_out(Command::Restart).unwrap();
-        assert!(player.game.frame().pixels == start && length(&player).contains("seed 3  step 0"));
-        player.carry_out(Command::NextSeed).unwrap();
-        assert!(length(&player).contains("seed 4"));
-        (0..6).for_each(|_| player.carry_out(Command::PreviousSeed).unwrap());
-        assert!(length(&player).contains("seed 0"));
-    }
-
     #[test]
     fn the_screen_shows_the_frame_and_the_numbers() {
         let player = player("MortarMayhemB-Grid-v0");

@@ -115,15 +115,6 @@ macro_rules! row_name {
     };
 }
 
-macro_rules! presence {
-    (required) => {
-        true
-    };
-    (optional) => {
-        false
-    };
-}
-
 /// Defines the enum of a table, with the table as its documentation.
 macro_rules! section_table {
     (
@@ -170,7 +161,7 @@ macro_rules! section_table {
 
             fn is_required(self) -> bool {
                 match self {
-                    $($table::$variant => presence!($presence),)*
+                    $($table::$variant => matches!(stringify!($presence), "required"),)*
                 }
             }
         }

@@ -107,21 +107,6 @@ mod tests {
     }
 
     #[test]
-    fn copies_and_other_pools_buffers_are_not_current() {
-        let (mut buffers, mut others, layout) = (Buffers::new(1), Buffers::new(3), layout());
-        let mut batch = zeroed(layout.blocks());
-        write(&mut buffers, &layout, &mut batch);
-        assert!(!write(&mut others, &layout, &mut batch).current);
-        assert!(!write(&mut buffers, &layout, &mut batch).current);
-        let mut copy = batch.clone();
-        assert!(write(&mut buffers, &layout, &mut batch).current);
-        assert!(!write(&mut buffers, &layout, &mut copy).current, "the record belongs to the original's second write");
-        let mut later = batch.clone();
-        assert!(write(&mut buffers, &layout, &mut later).current, "a copy of the last write is current");
-        assert!(!write(&mut buffers, &layout, &mut batch).current, "but only one of the two");
-    }
-
-    #[test]
     fn the_least_recently_written_record_is_replaced() {
         let (mut buffers, layout) = (Buffers::new(1), layout());
         let mut batches = vec![zeroed(layout.blocks()); MAX_BUFFERS + 1];

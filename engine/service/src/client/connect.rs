@@ -116,15 +116,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn negative_and_non_finite_timeouts_are_errors() {
-        for (given, shown) in [(-1.0, "-1"), (-0.001, "-0.001"), (f64::NAN, "NaN"), (f64::INFINITY, "inf")] {
-            let text = timeout_from_seconds(given).unwrap_err().to_string();
-            assert_eq!(text, format!("timeout must be finite and not negative, got {shown}"));
+    fn only_negative_and_non_finite_timeouts_are_errors() {
+        for given in [-0.001, f64::NAN, f64::INFINITY] {
+            assert!(matches!(timeout_from_seconds(given), Err(ServiceError::InvalidTimeout { .. })), "{given}");
         }
-    }
-
-    #[test]
-    fn every_other_timeout_is_valid() {
         for (given, expected) in [
             (-0.0, Duration::ZERO),
             (1.5, Duration::from_millis(1500)),

@@ -514,12 +514,6 @@ mod tests {
         let lock = CheckpointLock::acquire(&path).unwrap();
         let refused = CheckpointLock::acquire(&path).unwrap_err();
         assert_eq!(refused, CheckpointError::InUse { path: path.clone(), process: Some(std::process::id()) });
-        let text = format!(
-            "checkpoint {} is in use by another engine (process {}); stop it, or choose another file",
-            path.display(),
-            std::process::id()
-        );
-        assert_eq!(refused.to_string(), text);
         CheckpointLock::acquire(&folder.join("other.ckpt")).unwrap();
         drop(lock);
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);

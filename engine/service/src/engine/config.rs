@@ -227,19 +227,13 @@ mod tests {
     }
 
     #[test]
-    fn environments_are_numbered_across_groups() {
-        let pools = config().groups(3).pools().unwrap();
-        let numbers: Vec<_> = pools.iter().map(|pool| (pool.first_env, pool.num_envs, pool.total_envs)).collect();
-        assert_eq!(numbers, [(0, 2, 6), (2, 2, 6), (4, 2, 6)]);
-    }
-
-    #[test]
-    fn environments_are_numbered_across_engines() {
+    fn environments_are_numbered_across_groups_and_engines() {
         let numbered = |first_env, total_envs| {
             let pool = config().pool.first_env(first_env).total_envs(total_envs);
             let pools = config().pool(pool).groups(2).pools().unwrap();
             pools.iter().map(|pool| (pool.first_env, pool.total_envs)).collect::<Vec<_>>()
         };
+        assert_eq!(numbered(0, 2), [(0, 4), (2, 4)]);
         assert_eq!(numbered(4, 12), [(4, 12), (6, 12)]);
         assert_eq!(numbered(4, 6), [(4, 8), (6, 8)]);
         // A total that is too small, which the pools refuse.

@@ -246,14 +246,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_kind_has_its_own_code() {
-        for kind in RequestKind::ALL {
-            assert_eq!(RequestKind::from_code(kind.code()), Some(kind));
-        }
-        assert_eq!(RequestKind::from_code(0), None);
-    }
-
-    #[test]
     fn the_text_of_a_rejection_is_cut_between_characters_at_the_end_of_the_payload() {
         let mut payload = zeroed(3);
         for (given, kept) in [
