@@ -2,7 +2,7 @@
 
 use crate::support::player::Player;
 use endless_gym::memory_gym;
-use endless_gym::pool::{Experts, PoolConfig, Seeding};
+use endless_gym::pool::{Autoreset, EnvReset, Experts, ExpertsError, PoolConfig, ResetRequest, Seeding};
 
 /// Plays `num_envs` environments with seeds from 0 on, for `steps` steps or until all first episodes have ended.
 /// Returns the info of each first episode that ended.
@@ -85,107 +85,81 @@ fn endless_searing_spotlights_lasts() {
     assert!(ended.iter().all(Option::is_none), "{ended:?}");
 }
 
-/// Experts of a pool, in every mode.
-mod pools {
-    use endless_gym::batch::{Batch, zeroed};
-    use endless_gym::memory_gym;
-    use endless_gym::pool::{
-        Autoreset, EnvReset, Experts, ExpertsError, Pool, PoolConfig, ResetRequest, Seeding, Threads,
-    };
+/// Environments and episodes of each in the tests of a pool's experts.
+const NUM_ENVS: usize = 3;
+const EPISODES: usize = 3;
 
-    const NUM_ENVS: usize = 3;
-    const EPISODES: usize = 3;
+/// Returns and lengths of the first episodes of each environment.
+type Episodes = [Vec<(f64, i32)>; NUM_ENVS];
 
-    /// Returns and lengths of the first episodes of each environment.
-    type Episodes = [Vec<(f64, i32)>; NUM_ENVS];
+fn config(id: &str, autoreset: Autoreset) -> PoolConfig {
+    let seeding = Seeding::List(vec![5, 6, 7, 8, 9, 10]);
+    PoolConfig::new(id, NUM_ENVS).features(true).frames(None).autoreset(autoreset).seeding(seeding)
+}
 
-    fn config(id: &str, autoreset: Autoreset) -> PoolConfig {
-        let seeding = Seeding::List(vec![5, 6, 7, 8, 9, 10]);
-        PoolConfig::new(id, NUM_ENVS).features(true).frames(None).autoreset(autoreset).seeding(seeding)
-    }
-
-    /// Plays until every environment has ended [`EPISODES`] episodes.
-    fn play(id: &str, autoreset: Autoreset) -> Episodes {
-        let mut pool = Pool::new(memory_gym(), &config(id, autoreset), &Threads::new(1).unwrap()).unwrap();
-        let mut blocks = zeroed(pool.layout().blocks());
-        pool.reset(ResetRequest::All, &mut blocks).unwrap();
-        let mut experts = Experts::new(memory_gym(), id, NUM_ENVS, autoreset).unwrap();
-        let mut actions = vec![0; NUM_ENVS * pool.spec().action_space.width()];
-        let mut episodes = Episodes::default();
-        for _ in 0..5000 {
-            experts.act(&Batch::new(pool.layout(), &blocks), &mut actions).unwrap();
-            pool.step(&actions, &mut blocks).unwrap();
-            let batch = Batch::new(pool.layout(), &blocks);
-            let ended: Vec<u8> = batch.terminated().to_vec();
-            for env in (0..NUM_ENVS).filter(|env| ended[*env] == 1) {
-                episodes[env].push((batch.episode_return()[env], batch.episode_length()[env]));
-            }
-            if autoreset == Autoreset::Disabled && ended.contains(&1) {
-                let each: Vec<_> =
-                    ended.iter().map(|ended| if *ended == 1 { EnvReset::Next } else { EnvReset::Keep }).collect();
-                pool.reset(ResetRequest::Each(&each), &mut blocks).unwrap();
-            }
-            if episodes.iter().all(|episodes| episodes.len() >= EPISODES) {
-                break;
-            }
+/// Plays until every environment has ended [`EPISODES`] episodes.
+fn play_pool(id: &str, autoreset: Autoreset) -> Episodes {
+    let mut player = Player::started(&config(id, autoreset));
+    let mut experts = Experts::new(memory_gym(), id, NUM_ENVS, autoreset).unwrap();
+    let mut actions = vec![0; NUM_ENVS * player.pool.spec().action_space.width()];
+    let mut episodes = Episodes::default();
+    while episodes.iter().any(|episodes| episodes.len() < EPISODES) {
+        experts.act(&player.batch(), &mut actions).unwrap();
+        player.step(&actions);
+        let batch = player.batch();
+        let ended = [0, 1, 2].map(|env| batch.terminated()[env] == 1);
+        for env in (0..NUM_ENVS).filter(|env| ended[*env]) {
+            episodes[env].push((batch.episode_return()[env], batch.episode_length()[env]));
         }
-        episodes.iter_mut().for_each(|episodes| episodes.truncate(EPISODES));
-        episodes
-    }
-
-    /// The same episodes, each in an environment of its own, played by a new expert.
-    fn alone(id: &str) -> Episodes {
-        let spec = memory_gym().spec(id).unwrap();
-        std::array::from_fn(|env| {
-            let episode = |number: usize| {
-                let config = config(id, Autoreset::Disabled).num_envs(1).total_envs(1);
-                let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
-                let mut blocks = zeroed(pool.layout().blocks());
-                let seed = 5 + (number * NUM_ENVS + env) as u64 % 6;
-                pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
-                let (mut expert, mut action) = (memory_gym().expert(id).unwrap(), vec![0; spec.action_space.width()]);
-                loop {
-                    let batch = Batch::new(pool.layout(), &blocks);
-                    if batch.terminated()[0] == 1 {
-                        return (batch.episode_return()[0], batch.episode_length()[0]);
-                    }
-                    expert.act(batch.features(), batch.vector_observation(), &mut action);
-                    pool.step(&action, &mut blocks).unwrap();
-                }
-            };
-            (0..EPISODES).map(episode).collect()
-        })
-    }
-
-    #[test]
-    fn every_episode_is_played_as_by_a_new_expert_in_every_mode() {
-        for id in ["MortarMayhem-Grid-v0", "MortarMayhemB-Grid-v0", "MysteryPath-Grid-v0"] {
-            let expected = alone(id);
-            assert!(expected.iter().flatten().all(|(total, length)| *total > 0.0 && *length > 5), "{id}: {expected:?}");
-            for mode in Autoreset::ALL {
-                assert_eq!(play(id, mode), expected, "{id}, {mode}");
-            }
+        if autoreset == Autoreset::Disabled {
+            let each = ended.map(|ended| if ended { EnvReset::Next } else { EnvReset::Keep });
+            player.reset(ResetRequest::Each(&each));
         }
     }
+    episodes.iter_mut().for_each(|episodes| episodes.truncate(EPISODES));
+    episodes
+}
 
-    #[test]
-    fn batches_and_actions_of_other_sizes_are_errors() {
-        let id = "MortarMayhemB-Grid-v0";
-        let pool = |config: &PoolConfig| Pool::new(memory_gym(), config, &Threads::new(1).unwrap()).unwrap();
-        let act = |pool: &Pool, actions: &mut [i32]| {
-            let blocks = zeroed(pool.layout().blocks());
-            Experts::new(memory_gym(), id, NUM_ENVS, Autoreset::NextStep)?
-                .act(&Batch::new(pool.layout(), &blocks), actions)
+/// The same episodes, each in an environment of its own, played by a new expert.
+fn alone(id: &str) -> Episodes {
+    std::array::from_fn(|env| {
+        let episode = |number: usize| {
+            let mut player = Player::new(&config(id, Autoreset::Disabled).num_envs(1).total_envs(1));
+            player.reset(ResetRequest::Seed(5 + (number * NUM_ENVS + env) as u64 % 6));
+            let mut expert = memory_gym().expert(id).unwrap();
+            let mut action = vec![0; player.pool.spec().action_space.width()];
+            while player.batch().terminated()[0] == 0 {
+                expert.act(player.batch().features(), player.batch().vector_observation(), &mut action);
+                player.step(&action);
+            }
+            (player.batch().episode_return()[0], player.batch().episode_length()[0])
         };
-        let good = config(id, Autoreset::NextStep);
-        let needed = NUM_ENVS * memory_gym().spec(id).unwrap().features.len();
-        assert_eq!(act(&pool(&good), &mut [0; NUM_ENVS]), Ok(()));
-        assert_eq!(act(&pool(&good), &mut [0; 2]), Err(ExpertsError::Actions { given: 2, needed: NUM_ENVS }));
-        let plain = good.clone().features(false);
-        let error = ExpertsError::Features { given: 0, needed, num_envs: NUM_ENVS };
-        assert_eq!(act(&pool(&plain), &mut [0; NUM_ENVS]), Err(error));
-        let fewer = good.num_envs(2).total_envs(2);
-        let error = ExpertsError::Features { given: needed / 3 * 2, needed, num_envs: NUM_ENVS };
-        assert_eq!(act(&pool(&fewer), &mut [0; NUM_ENVS]), Err(error));
+        (0..EPISODES).map(episode).collect()
+    })
+}
+
+#[test]
+fn every_episode_is_played_as_by_a_new_expert_in_every_mode() {
+    for id in ["MortarMayhem-Grid-v0", "MortarMayhemB-Grid-v0", "MysteryPath-Grid-v0"] {
+        let expected = alone(id);
+        assert!(expected.iter().flatten().all(|(total, length)| *total > 0.0 && *length > 5), "{id}: {expected:?}");
+        for mode in Autoreset::ALL {
+            assert_eq!(play_pool(id, mode), expected, "{id}, {mode}");
+        }
     }
+}
+
+#[test]
+fn batches_and_actions_of_other_sizes_are_errors() {
+    let id = "MortarMayhemB-Grid-v0";
+    let act = |config: &PoolConfig, actions: &mut [i32]| {
+        Experts::new(memory_gym(), id, NUM_ENVS, Autoreset::NextStep)?.act(&Player::new(config).batch(), actions)
+    };
+    let good = config(id, Autoreset::NextStep);
+    let needed = NUM_ENVS * memory_gym().spec(id).unwrap().features.len();
+    assert_eq!(act(&good, &mut [0; NUM_ENVS]), Ok(()));
+    assert_eq!(act(&good, &mut [0; 2]), Err(ExpertsError::Actions { given: 2, needed: NUM_ENVS }));
+    let error = |given| Err(ExpertsError::Features { given, needed, num_envs: NUM_ENVS });
+    assert_eq!(act(&good.clone().features(false), &mut [0; NUM_ENVS]), error(0));
+    assert_eq!(act(&good.num_envs(2).total_envs(2), &mut [0; NUM_ENVS]), error(needed / 3 * 2));
 }

@@ -182,30 +182,3 @@ fn random_play_depends_only_on_its_seeds() {
     assert!(first != film("2", "random"));
     assert!(film("1", "expert") == film("2", "expert"));
 }
-
-#[test]
-fn a_failed_recording_is_an_error_and_leaves_no_file() {
-    let place = Place::new();
-    let run = |arguments: &[&str]| {
-        let output = place.endless(&[&["record"], arguments].concat()).current_dir(place.root()).output().unwrap();
-        (output.status.code(), text(&output.stderr).to_owned())
-    };
-    for (arguments, status, message) in [
-        (&["MysteryPath-v0", "--film", "a.GIF"][..], 1, "a film's name must end in .webp or .mp4, got `a.GIF`"),
-        (&["MysteryPath-v1", "--film", "a.webp"], 1, "no environment `MysteryPath-v1`; did you mean MysteryPath-v0?"),
-        (&["MysteryPath-v0", "--film", "no/a.webp"], 1, "cannot write no/a.webp: "),
-        (&["MysteryPath-v0", "--film", "a.webp", "--option", "x"], 1, "--option x: expected NAME=VALUE"),
-        (&["MortarMayhem-v0", "--film=a.webp", "--option", "arena_size=9"], 1, "arena_size"),
-        (&["MysteryPath-v0", "--film", "a.webp", "--fps", "0"], 2, "0 is not in 1..=100"),
-        (&["--film", "a.webp"], 2, "<ID>"),
-        (&["MysteryPath-v0", "--error-rate", "0", "0.1"], 1, "Python package's program"),
-    ] {
-        let (code, said) = run(arguments);
-        assert_eq!(code, Some(status), "{arguments:?}: {said}");
-        assert!(said.contains(message), "{arguments:?}: {said}");
-    }
-    assert_eq!(std::fs::read_dir(place.root()).unwrap().count(), 0);
-    let help = place.run(&["record", "--help"]);
-    assert!(help.status.success());
-    assert!(text(&help.stdout).contains("[default: 4]"), "{}", text(&help.stdout));
-}

@@ -1,16 +1,14 @@
 //! Compares with the original live: random seeds, options and actions must give no difference.
 //!
 //! The engine plays first, with experts that err now and then, so that episodes get far. The original then plays the
-//! same actions, and a replay compares the two. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original. The
+//! same actions, and a replay compares the two. `ENDLESS_ORIGINAL_PYTHON` names a Python 3.11 with memory-gym==1.0.2 and numpy<2. The
 //! tests cannot run without it, so they are ignored by default; `cargo xtask test --all` sets up the original and runs
 //! them. `ENDLESS_LIVE_STEPS`, which `cargo xtask live` sets, is the number of steps to compare for each id, with
 //! different seeds in every run; without it, all runs are the same.
 
-use std::io::{BufRead, BufReader, Write};
-use std::process::{ChildStdin, ChildStdout, Command, Stdio};
-
 use crate::support::player::Player;
-use crate::support::process::Process;
+use crate::support::process::Answering;
+use crate::support::recorded::{memory_gym_ids, reference};
 use endless_gym::envs::EnvSpec;
 use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
@@ -23,33 +21,6 @@ use serde_json::{Map, Value as Json, json};
 
 /// Maximum number of steps played in an episode.
 const MAX_STEPS: usize = 400;
-
-/// The original in a separate process.
-struct Original {
-    _process: Process,
-    requests: ChildStdin,
-    answers: BufReader<ChildStdout>,
-}
-
-impl Original {
-    fn start() -> Self {
-        let python = std::env::var("ENDLESS_ORIGINAL_PYTHON").expect(
-            "run `cargo xtask test --all`, or set ENDLESS_ORIGINAL_PYTHON to a Python 3.11 with memory-gym==1.0.2 and numpy<2",
-        );
-        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/reference/play.py");
-        let mut command = Command::new(python);
-        let mut process = Process::spawn(command.arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()));
-        let (requests, answers) = (process.0.stdin.take().unwrap(), process.0.stdout.take().unwrap());
-        Original { _process: process, requests, answers: BufReader::new(answers) }
-    }
-
-    fn play(&mut self, request: &Json) -> Json {
-        writeln!(self.requests, "{request}").unwrap();
-        let mut line = String::new();
-        self.answers.read_line(&mut line).unwrap();
-        serde_json::from_str(&line).unwrap_or_else(|error| panic!("the original answers `{line:.300}`: {error}"))
-    }
-}
 
 /// One environment object that plays a few episodes.
 #[derive(Clone, Debug)]
@@ -121,14 +92,15 @@ fn compare(id: &str) {
     let asked: Option<usize> = std::env::var("ENDLESS_LIVE_STEPS").ok().map(|text| text.parse().unwrap());
     let wanted = asked.unwrap_or(1500);
     let mut seeds = SmallRng::seed_from_u64(asked.map_or(0, |_| rand::random()));
-    let original = std::cell::RefCell::new(Original::start());
+    let original = Answering::start("ENDLESS_ORIGINAL_PYTHON", &reference().join("play.py"), &[]);
+    let original = std::cell::RefCell::new(original);
     let (steps, raised) = (std::cell::Cell::new(0), std::cell::Cell::new(0));
     while steps.get() < wanted {
         let config = Config { cases: 4, failure_persistence: None, ..Config::default() };
         let random = TestRng::from_seed(RngAlgorithm::ChaCha, &seeds.random::<[u8; 32]>());
         TestRunner::new_with_rng(config, random)
             .run(&case(spec), |case| {
-                let answer = original.borrow_mut().play(&play(spec, &case));
+                let answer: Json = original.borrow_mut().ask(&play(spec, &case));
                 if answer.get("error").is_some() {
                     raised.set(raised.get() + 1);
                     return Ok(());
@@ -170,15 +142,4 @@ macro_rules! live {
     };
 }
 
-live! {
-    mortar_mayhem: "MortarMayhem-v0",
-    mortar_mayhem_grid: "MortarMayhem-Grid-v0",
-    mortar_mayhem_b: "MortarMayhemB-v0",
-    mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
-    endless_mortar_mayhem: "Endless-MortarMayhem-v0",
-    mystery_path: "MysteryPath-v0",
-    mystery_path_grid: "MysteryPath-Grid-v0",
-    endless_mystery_path: "Endless-MysteryPath-v0",
-    searing_spotlights: "SearingSpotlights-v0",
-    endless_searing_spotlights: "Endless-SearingSpotlights-v0",
-}
+memory_gym_ids!(live);

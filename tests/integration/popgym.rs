@@ -1,8 +1,6 @@
 //! Compares POPGym's ids with the original: recorded episodes, and live with new seeds.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, Write};
-use std::process::{Command, Stdio};
 
 use endless_gym::envs::ActionSpace;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
@@ -14,7 +12,7 @@ use serde::Deserialize;
 use serde_json::{Map, Value as Json, json};
 
 use crate::support::player::Player;
-use crate::support::process::Process;
+use crate::support::process::Answering;
 use crate::support::recorded::reference;
 
 /// One environment object of the original.
@@ -112,16 +110,9 @@ fn replay_recorded(family: &str) {
 /// Steps of each id that are compared with the live original.
 const LIVE_STEPS: usize = 5_000;
 
-/// Compares a family with the original in a separate process.
+/// Compares a family with the original, popgym[navigation]==1.0.7, in a separate process.
 fn compare_live(family: &str) {
-    let python = std::env::var("ENDLESS_POPGYM_PYTHON").expect(
-        "run `cargo xtask test --all`, or set ENDLESS_POPGYM_PYTHON to a Python with popgym[navigation]==1.0.7",
-    );
-    let script = reference().join("popgym/record.py");
-    let mut command = Command::new(python);
-    let mut process = Process::spawn(command.arg(script).arg("-").stdin(Stdio::piped()).stdout(Stdio::piped()));
-    let (mut requests, answers) = (process.0.stdin.take().unwrap(), process.0.stdout.take().unwrap());
-    let mut answers = BufReader::new(answers);
+    let mut original = Answering::start("ENDLESS_POPGYM_PYTHON", &reference().join("popgym/record.py"), &["-"]);
     let given = std::env::var("ENDLESS_LIVE_STEPS").ok().map(|steps| steps.parse::<usize>().unwrap());
     let mut random: SmallRng = match given {
         Some(_) => rand::make_rng(),
@@ -142,11 +133,7 @@ fn compare_live(family: &str) {
             }
             let episodes = random.random_range(1..6);
             let request = json!({"env": id, "seed": random.random::<u64>(), "episodes": episodes, "options": options});
-            writeln!(requests, "{request}").unwrap();
-            let mut line = String::new();
-            answers.read_line(&mut line).unwrap();
-            let trace = serde_json::from_str(&line).unwrap_or_else(|error| panic!("{request}: `{line:.300}`: {error}"));
-            steps += replay(&trace);
+            steps += replay(&original.ask(&request));
         }
         println!("{id}: {steps} steps without a difference");
     }

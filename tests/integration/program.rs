@@ -255,14 +255,59 @@ fn errors_of_arguments_are_one_clear_line() {
             "; cannot run /other: ",
         ),
         (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "cannot run /no/python: "),
+        (vec!["play", "Pong-v0"], "no environment `Pong-v0`"),
+        (vec!["play", "MysteryPath-v0", "--option", "speed"], "--option speed: expected NAME=VALUE"),
+        (vec!["play", "MysteryPath-v0", "--option", "speed=1"], "no reset parameter `speed`"),
+        // POPGym is not on the page.
+        (
+            vec!["play", "popgym-RepeatFirstEasy-v0"],
+            "or write the page of your own crate with `endless page --out FOLDER`",
+        ),
+        (vec!["play", "--terminal"], "--terminal needs a terminal, and standard input is none"),
+        (vec!["view", "--terminal"], "--terminal needs a terminal, and standard input is none"),
+        (vec!["play", "Chess-v0", "--terminal"], "no environment `Chess-v0`"),
+        (vec!["play", "--terminal", "--option", "arena_size=9"], "arena_size"),
+        (vec!["play", "--terminal", "--hold=-1"], "--hold must be finite and 0 or more, got -1"),
+        (vec!["record", "MysteryPath-v0", "--film", "a.GIF"], "a film's name must end in .webp or .mp4, got `a.GIF`"),
+        (
+            vec!["record", "MysteryPath-v1", "--film", "a.webp"],
+            "no environment `MysteryPath-v1`; did you mean MysteryPath-v0?",
+        ),
+        (vec!["record", "MysteryPath-v0", "--film", "no/a.webp"], "cannot write no/a.webp: "),
+        (vec!["record", "MysteryPath-v0", "--film", "a.webp", "--option", "x"], "--option x: expected NAME=VALUE"),
+        (vec!["record", "MortarMayhem-v0", "--film=a.webp", "--option", "arena_size=9"], "arena_size"),
+        (vec!["record", "MysteryPath-v0", "--error-rate", "0", "0.1"], "Python package's program"),
     ] {
-        let output = place.run(&arguments);
+        let output = place.endless(&arguments).current_dir(place.root()).output().unwrap();
         let stderr = text(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{arguments:?}: {stderr}");
         assert!(stderr.starts_with("endless: ") && stderr.contains(part), "{arguments:?}: {stderr}");
         assert_eq!(stderr.lines().count(), 1, "{stderr}");
     }
+    for (arguments, part) in [
+        (vec!["record", "MysteryPath-v0", "--film", "a.webp", "--fps", "0"], "0 is not in 1..=100"),
+        (vec!["record", "--film", "a.webp"], "<ID>"),
+        (vec!["serve", "--every=5m"], "--checkpoint <FILE>"),
+        (vec!["serve", "--resume"], "--checkpoint <FILE>"),
+        (vec!["serve", "--checkpoint=state", "--every=soon"], "invalid value 'soon'"),
+    ] {
+        let output = place.endless(&arguments).current_dir(place.root()).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        assert!(text(&output.stderr).contains(part), "{arguments:?}: {}", text(&output.stderr));
+    }
+    assert!(text(&place.run(&["record", "--help"]).stdout).contains("[default: 4]"));
     place.assert_nothing_left();
+}
+
+/// Only release builds contain the page, once it is built; `xtask/packages/check.py` plays on that of the wheel.
+#[test]
+#[cfg(debug_assertions)]
+fn a_program_without_the_page_says_how_to_play() {
+    let output =
+        Place::new().run(&["play", "SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]", "--open"]);
+    assert_eq!(output.status.code(), Some(1));
+    let stderr = text(&output.stderr);
+    assert!(stderr.contains("`--terminal`") && stderr.contains("run `cargo xtask play`"), "{stderr}");
 }
 
 #[test]
@@ -312,7 +357,12 @@ fn page_says_what_a_crate_or_cargo_lacks() {
     let message = format!(r#"{{"reason":"compiler-artifact","filenames":["{}"]}}"#, library.display());
     let page = |script: &str| {
         let cargo = place.script("cargo", script);
-        place.endless(&["page"]).env("CARGO", cargo).current_dir(place.root()).output().unwrap()
+        place
+            .endless(&["page", "--manifest-path", "Cargo.toml"])
+            .env("CARGO", cargo)
+            .current_dir(place.root())
+            .output()
+            .unwrap()
     };
     let builds = format!("echo '{message}'");
     for (script, engine, part) in [

@@ -20,9 +20,7 @@ use endless_gym_core::batch::{ActionSection, Contents, action_layout, batch_layo
 
 #[test]
 fn groups_are_reset_and_stepped_independently() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 4, 2);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (_place, _engine, mut trainer) = Place::started(4, 2);
     let specification = trainer.specification().clone();
     assert_eq!((specification.groups, specification.num_envs), (2, 4));
     assert_eq!(specification.service, "gym");
@@ -140,9 +138,7 @@ fn the_error_for_an_unknown_engine_lists_the_running_ones() {
 
 #[test]
 fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, _engine, mut trainer) = Place::started(2, 1);
     let config = place.connect_config("gym");
     let mut observer = Observer::connect(&config, 0).unwrap();
     assert!(observer.newest().unwrap().is_none());
@@ -165,28 +161,8 @@ fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
 }
 
 #[test]
-fn the_next_trainer_plays_after_one_was_killed() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 2);
-    for _ in 0..2 {
-        let mut killed = place.role("trainer gym");
-        // The observer shows that the trainer steps.
-        let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
-        observer.next(TIMEOUT).unwrap();
-        killed.kill();
-        let mut trainer = place.trainer("gym").unwrap();
-        // The environments are still in the dead trainer's episodes.
-        assert_rejected(try_step(&mut trainer, 0), Rejection::NotReset, "");
-        play(&mut trainer, 0, 5);
-        play(&mut trainer, 1, 5);
-    }
-}
-
-#[test]
 fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
-    let place = Place::new();
-    let mut engine = place.engine("gym", 2, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, mut engine, mut trainer) = Place::started(2, 1);
     play(&mut trainer, 0, 3);
     let held = step(&mut trainer, 0);
     let frame = held.batch().observation().to_vec();
@@ -265,9 +241,7 @@ fn an_engine_that_ends_gives_up_its_name_without_the_lock() {
 
 #[test]
 fn a_trainer_notices_that_its_engine_has_ended() {
-    let place = Place::new();
-    let engine = place.engine("gym", 1, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (_place, engine, mut trainer) = Place::started(1, 1);
     play(&mut trainer, 0, 1);
     engine.end();
     assert_error!(try_step(&mut trainer, 0), ServiceError::EngineLost { .. });
@@ -275,9 +249,7 @@ fn a_trainer_notices_that_its_engine_has_ended() {
 
 #[test]
 fn a_trainer_reports_a_lost_engine_while_the_namespace_is_locked() {
-    let place = Place::new();
-    let mut engine = place.engine("gym", 1, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, mut engine, mut trainer) = Place::started(1, 1);
     play(&mut trainer, 0, 1);
     step(&mut trainer, 0);
     engine.kill();
@@ -309,9 +281,7 @@ fn a_waiting_observer_notices_that_its_engine_has_died() {
 
 #[test]
 fn a_late_answer_can_be_received_after_a_timeout() {
-    let place = Place::new();
-    let engine = place.engine("gym", 1, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (_place, engine, mut trainer) = Place::started(1, 1);
     play(&mut trainer, 0, 1);
     engine.stop();
     send(&mut trainer, 0);
@@ -323,9 +293,7 @@ fn a_late_answer_can_be_received_after_a_timeout() {
 
 #[test]
 fn nothing_is_left_behind() {
-    let place = Place::new();
-    let engine = place.engine("gym", 2, 2);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, engine, mut trainer) = Place::started(2, 2);
     play(&mut trainer, 1, 2);
     assert!(!place.leftovers().is_empty());
     trainer.reset(0, ResetRequest::All).unwrap();
@@ -348,15 +316,13 @@ fn nothing_is_left_behind() {
 fn bad_messages_are_answered_with_rejections() {
     let place = Place::new();
     let _engine = place.engine("gym", 2, 1);
-    let specification = place.trainer("gym").unwrap().specification().clone();
-    let foreign = Foreign::new(place.namespace(), &specification);
-    let good = RequestHeader::reset_all(&specification);
+    let (foreign, good) = Foreign::of(&place);
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
 
     let version = RequestHeader { layout_version: 77, ..good };
     let step = RequestHeader { kind: 1, ..good };
     let actions_of = |number: i32| {
-        let layout = &specification.action;
+        let layout = &foreign.specification.action;
         move |blocks: &mut [Block]| layout.write::<i32>(blocks, ActionSection::Action).fill(number)
     };
     let whole = foreign.blocks();
@@ -369,7 +335,7 @@ fn bad_messages_are_answered_with_rejections() {
         let (status, text) = answer.unwrap();
         assert!(status != 0 && text.contains(part), "{text}");
     }
-    let earlier = RequestHeader { incarnation: specification.incarnation.wrapping_sub(1), ..good };
+    let earlier = RequestHeader { incarnation: good.incarnation.wrapping_sub(1), ..good };
     assert_eq!(foreign.ask(earlier, foreign.blocks(), |_| {}), None, "a request for another incarnation is dropped");
 
     // The engine still answers.
@@ -383,7 +349,9 @@ fn another_version_is_refused_with_both_numbers() {
     let place = Place::new();
     let _old = foreign::engine_of_version(place.namespace(), "old", 999);
     let error = assert_error!(place.trainer_now("old"), ServiceError::Version { layout, .. } if layout == "999");
-    assert!(error.to_string().contains("install the same version"), "{error}");
+    let own =
+        concat!("(endless-gym ", env!("CARGO_PKG_VERSION"), "), got 999 (endless-gym 0.0.9); install the same version");
+    assert!(error.to_string().contains(own), "{error}");
 }
 
 const CONTENTS: Contents = Contents { frames: None, features: false, state: false, final_observation: false };
@@ -479,22 +447,17 @@ fn of_several_engines_one_takes_the_name_of_a_dead_one() {
 
 #[test]
 fn a_header_that_changes_after_its_check_is_not_read_again() {
-    let place = Place::new();
-    let engine = place.engine("model", 1, 1);
-    let specification = place.trainer("model").unwrap().specification().clone();
-    let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
-    let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
+    let (_place, mut foreign, mut observer) = foreign::observed(1);
     let mut header = foreign.send(5);
     let received = observer.newest().unwrap().unwrap();
     assert_eq!((received.group(), received.step()), (0, 5));
     let blocks = received.blocks().len();
-    assert_eq!(blocks, specification.batch.blocks());
+    assert_eq!(blocks, observer.specification().batch.blocks());
     for forged in [0, 1 << 40] {
         header.overwrite(7, 99, forged);
         assert_eq!((received.group(), received.step(), received.blocks().len()), (0, 5, blocks));
         assert_eq!(received.batch().reward(), [0.0]);
     }
-    engine.end();
 }
 
 #[test]

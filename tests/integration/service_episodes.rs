@@ -18,9 +18,7 @@ fn next(value: &serde_json::Value, envs: &[usize]) -> NextOptions {
 
 #[test]
 fn next_options_and_running_episodes_equal_those_of_a_pool() {
-    let place = Place::new();
-    let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (_place, _engine, mut trainer) = Place::started(NUM_ENVS, 1);
     let mut player = Player::new(&PoolConfig::new(ID, NUM_ENVS));
     // Long texts, so that the answers need several messages.
     let long = |count: u32, length: usize| json!({"command_count": [count], "explosion_delay": vec![4; length]});
@@ -54,9 +52,7 @@ fn next_options_and_running_episodes_equal_those_of_a_pool() {
 
 #[test]
 fn mistakes_are_typed_errors() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, _engine, mut trainer) = Place::started(2, 1);
     assert_rejected(trainer.running_episodes(0, &[0], TIMEOUT), Rejection::NotReset, "reset");
     reset(&mut trainer, 0);
     let before = trainer.snapshot(0, 0, TIMEOUT).unwrap();
@@ -77,10 +73,8 @@ fn mistakes_are_typed_errors() {
     trainer.receive(0, TIMEOUT).unwrap();
 
     // Texts that are not lists of options, and lengths beyond the payload.
-    let specification = trainer.specification().clone();
     drop(trainer);
-    let foreign = Foreign::new(place.namespace(), &specification);
-    let good = RequestHeader::reset_all(&specification);
+    let (foreign, good) = Foreign::of(&place);
     for bytes in [0, 5, u64::MAX] {
         let (status, text) = foreign.ask(RequestHeader { kind: 8, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
         assert!(status != 0 && text.contains("options of next episodes must be a JSON list"), "{text}");

@@ -110,9 +110,7 @@ fn as_root_a_segment_of_another_user_is_reported_or_avoided() {
 #[test]
 #[ignore = "needs permission to create mount namespaces (unshare --mount --map-root-user)"]
 fn two_directories_of_one_path_share_nothing() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, _engine, mut trainer) = Place::started(2, 1);
     play(&mut trainer, 0, 1);
     // Make the segments look old by any clock.
     for segment in place.segments() {

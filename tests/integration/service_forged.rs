@@ -65,9 +65,7 @@ fn no_specification_text_makes_a_client_panic() {
 fn any_request_is_answered() {
     let place = Place::new();
     let _engine = place.engine("gym", 2, 1);
-    let specification = place.trainer("gym").unwrap().specification().clone();
-    let foreign = Foreign::new(place.namespace(), &specification);
-    let good = RequestHeader::reset_all(&specification);
+    let (foreign, good) = Foreign::of(&place);
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
     let header = (0..11_u32, [(); 3].map(|()| numbers()), any::<bool>());
     let requests = (header, 1..=foreign.blocks(), any::<u64>(), 0..=8_u8);
@@ -96,12 +94,11 @@ fn any_request_is_answered() {
 fn an_engine_survives_requests_that_change_while_it_reads_them() {
     let place = Place::new();
     let _engine = place.engine("gym", 4, 1);
-    let specification = place.trainer("gym").unwrap().specification().clone();
-    let foreign = Foreign::new(place.namespace(), &specification);
+    let (foreign, good) = Foreign::of(&place);
     let mut random = SmallRng::seed_from_u64(1);
     for _ in 0..300 {
         let (kind, bytes) = (random.random_range(1..10), random.random_range(0..5000));
-        let header = RequestHeader { kind, bytes, ..RequestHeader::reset_all(&specification) };
+        let header = RequestHeader { kind, bytes, ..good };
         foreign
             .ask_while_changing(header, || if random.random() { random.random_range(0..8) } else { random.random() });
     }
@@ -111,12 +108,7 @@ fn an_engine_survives_requests_that_change_while_it_reads_them() {
 
 #[test]
 fn an_observer_survives_batches_that_change_while_it_reads_them() {
-    let place = Place::new();
-    let engine = place.engine("model", 2, 1);
-    let specification = place.trainer("model").unwrap().specification().clone();
-    engine.end();
-    let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
-    let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
+    let (_place, mut foreign, mut observer) = foreign::observed(2);
     let done = AtomicBool::new(false);
     let (received, refused) = (AtomicU64::new(0), AtomicU64::new(0));
     std::thread::scope(|scope| {
@@ -158,12 +150,7 @@ fn an_observer_survives_batches_that_change_while_it_reads_them() {
 
 #[test]
 fn a_forged_payload_length_is_limited() {
-    let place = Place::new();
-    let engine = place.engine("model", 1, 1);
-    let specification = place.trainer("model").unwrap().specification().clone();
-    engine.end();
-    let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
-    let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
+    let (_place, mut foreign, mut observer) = foreign::observed(1);
     for (step, blocks) in [(5, 1 << 24), (6, 1 << 40)] {
         foreign.send(step).overwrite(0, step, blocks);
         let received = observer.newest().unwrap().unwrap();

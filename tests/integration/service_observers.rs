@@ -4,12 +4,11 @@ use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use endless_gym::memory_gym;
-use endless_gym::pool::PoolConfig;
-use endless_gym::service::{Engine, EngineConfig, EngineStatus, Observer, Observers, Trainer};
+use endless_gym::service::{Engine, EngineStatus, Observer, Observers};
 
 use crate::support::place::Place;
 use crate::support::process::{TIMEOUT, wait_until};
-use crate::support::service::{ID, play, reset, step};
+use crate::support::service::{play, reset, step};
 
 /// How often this thread has gone to sleep.
 fn sleeps() -> u64 {
@@ -20,9 +19,7 @@ fn sleeps() -> u64 {
 
 #[test]
 fn a_waiting_observer_sleeps_until_a_batch_of_its_group() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 2);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, _engine, mut trainer) = Place::started(2, 2);
     (0..2).for_each(|group| drop(reset(&mut trainer, group)));
     let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
     let (seen, sleeps) = std::thread::scope(|scope| {
@@ -47,9 +44,7 @@ fn a_waiting_observer_sleeps_until_a_batch_of_its_group() {
 
 #[test]
 fn a_batch_wakes_an_observer_at_once() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 2);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, _engine, mut trainer) = Place::started(2, 2);
     (0..2).for_each(|group| drop(reset(&mut trainer, group)));
     for all in [false, true] {
         let group = (!all).then_some(1);
@@ -127,47 +122,4 @@ fn dead_and_stopped_observers_hold_up_nobody() {
     });
     engine.stop();
     assert!(engine.join().unwrap().batches > 1500);
-}
-
-/// The trainer's speed beside observers that take every batch they can, in turn with that without observers.
-///
-/// ```console
-/// cargo test --release --test integration measure_the_price_of_observers -- --ignored --nocapture
-/// ```
-#[test]
-#[ignore = "measures"]
-fn measure_the_price_of_observers() {
-    const ROUNDS: usize = 7;
-    let place = Place::new();
-    let pool = PoolConfig::new(ID, 64);
-    let namespace = place.namespace().clone();
-    let config = EngineConfig::new("gym", pool, 0).namespace(namespace).observers(16);
-    let _engine = Engine::new(memory_gym(), &config).unwrap().spawn().unwrap();
-    let connect = place.connect_config("gym").timeout(TIMEOUT);
-    let mut trainer = Trainer::connect(&connect).unwrap();
-    drop(reset(&mut trainer, 0));
-    let rate = |trainer: &mut Trainer| {
-        let (start, mut steps) = (Instant::now(), 0.0);
-        while start.elapsed() < Duration::from_secs(1) {
-            drop(step(trainer, 0));
-            steps += 1.0;
-        }
-        steps / start.elapsed().as_secs_f64()
-    };
-    for count in [1, 4, 16] {
-        let mut ratios: Vec<f64> = (0..ROUNDS)
-            .map(|_| {
-                let alone = rate(&mut trainer);
-                let observers: Vec<_> = (0..count).map(|_| place.role("observer gym")).collect();
-                let connected = || EngineStatus::of(place.namespace(), "gym").unwrap().groups[0].observers.len();
-                wait_until("observers", || connected() == count);
-                let observed = rate(&mut trainer);
-                drop(observers);
-                wait_until("no observers", || connected() == 0);
-                observed / alone
-            })
-            .collect();
-        ratios.sort_by(f64::total_cmp);
-        println!("{count} observers: {:.3} ({:.3} to {:.3})", ratios[ROUNDS / 2], ratios[0], ratios[ROUNDS - 1]);
-    }
 }

@@ -104,9 +104,7 @@ fn a_paused_observer_keeps_its_slot() {
 
 #[test]
 fn an_idle_engine_resends_the_last_batch_to_a_resumed_observer() {
-    let place = Place::new();
-    let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, _engine, mut trainer) = Place::started(NUM_ENVS, 1);
     let mut expected = Player::new(&PoolConfig::new(ID, NUM_ENVS));
     let connect = || Observer::connect(&place.connect_config("gym"), 0).unwrap();
     let (mut observer, mut other) = (connect(), connect());

@@ -23,9 +23,7 @@ fn start(trainer: &mut Trainer) {
 
 #[test]
 fn after_a_timeout_and_a_reconnection_a_step_is_played_once() {
-    let place = Place::new();
-    let engine = place.engine("gym", 2, 2);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, engine, mut trainer) = Place::started(2, 2);
     assert_eq!(trainer.reconnect(TIMEOUT).unwrap().groups[0].last_request, LastRequest::None);
     start(&mut trainer);
     engine.stop();
@@ -55,9 +53,7 @@ fn after_a_timeout_and_a_reconnection_a_step_is_played_once() {
 
 #[test]
 fn a_timeout_names_a_long_request_with_its_duration() {
-    let place = Place::new();
-    let engine = place.engine("gym", 1024, 2);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, engine, mut trainer) = Place::started(1024, 2);
     let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
     let mut activity = || match observer.next(SHORT) {
         Err(ServiceError::TimedOut { activity, .. }) => activity,
@@ -102,9 +98,7 @@ fn replaced(place: &Place, trainer: &mut Trainer, num_envs: usize) -> (Process, 
 
 #[test]
 fn reconnecting_after_an_engines_death_reports_the_fate_of_the_last_request() {
-    let place = Place::new();
-    let mut engine = place.engine("gym", 2, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, mut engine, mut trainer) = Place::started(2, 1);
 
     // The engine dies before it takes the request.
     start(&mut trainer);
@@ -141,9 +135,7 @@ fn reconnecting_after_an_engines_death_reports_the_fate_of_the_last_request() {
 
 #[test]
 fn the_fate_of_a_request_is_unknown_if_the_engine_dies_during_it() {
-    let place = Place::new();
-    let mut engine = place.engine("gym", 1024, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, mut engine, mut trainer) = Place::started(1024, 1);
     trainer.reset(0, ResetRequest::All).unwrap();
     wait_until("the reset runs", || status(&place).groups[0].busy.is_some());
     engine.kill();
@@ -182,9 +174,7 @@ fn a_request_of_a_trainer_that_dies_or_is_dropped_is_played_at_most_once() {
 
 #[test]
 fn a_rejected_request_changes_nothing_and_its_whole_explanation_arrives() {
-    let place = Place::new();
-    let _engine = place.engine("gym", 2, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (_place, _engine, mut trainer) = Place::started(2, 1);
     start(&mut trainer);
     let name = "ä".repeat(4000);
     let options = serde_json::json!({ name.clone(): 1 });

@@ -33,9 +33,7 @@ fn play_both(trainer: &mut Trainer, pool: &mut Player, steps: std::ops::Range<us
 
 #[test]
 fn restored_environments_continue_identically_in_both_directions() {
-    let place = Place::new();
-    let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (_place, _engine, mut trainer) = Place::started(NUM_ENVS, 1);
     reset(&mut trainer, 0);
     let mut player = Player::new(&PoolConfig::new(ID, NUM_ENVS));
     player.reset(ResetRequest::Seed(3));
@@ -64,9 +62,7 @@ fn restored_environments_continue_identically_in_both_directions() {
 
 #[test]
 fn mistakes_are_typed_errors() {
-    let place = Place::new();
-    let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (place, _engine, mut trainer) = Place::started(NUM_ENVS, 1);
     assert_rejected(trainer.snapshot(0, 0, TIMEOUT), Rejection::NotReset, "reset");
     reset(&mut trainer, 0);
     let snapshot = trainer.snapshot(0, 0, TIMEOUT).unwrap();
@@ -85,12 +81,10 @@ fn mistakes_are_typed_errors() {
     drop(trainer);
     let mut next = place.trainer("gym").unwrap();
     assert_rejected(next.restore(0, 0, &snapshot, TIMEOUT), Rejection::NotReset, "reset");
-    let specification = next.specification().clone();
     drop(next);
 
     // Lengths beyond the payload are rejected.
-    let foreign = Foreign::new(place.namespace(), &specification);
-    let good = RequestHeader::reset_all(&specification);
+    let (foreign, good) = Foreign::of(&place);
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
     for bytes in [u64::MAX, 1 << 40] {
         let (status, text) = foreign.ask(RequestHeader { kind: 6, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
@@ -100,9 +94,7 @@ fn mistakes_are_typed_errors() {
 
 #[test]
 fn a_late_snapshot_is_returned_by_the_same_call() {
-    let place = Place::new();
-    let engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = place.trainer("gym").unwrap();
+    let (_place, engine, mut trainer) = Place::started(NUM_ENVS, 1);
     reset(&mut trainer, 0);
     let expected = trainer.snapshot(0, 1, TIMEOUT).unwrap();
     engine.stop();

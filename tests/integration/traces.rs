@@ -3,7 +3,7 @@
 use std::io::Read;
 
 use crate::support::player::Player;
-use crate::support::recorded::{reference, traces, traces_with_views};
+use crate::support::recorded::{memory_gym_ids, reference, traces, traces_with_views};
 use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Trace, TraceError, replay};
@@ -32,18 +32,7 @@ macro_rules! traces {
     )* };
 }
 
-traces! {
-    mortar_mayhem: "MortarMayhem-v0",
-    mortar_mayhem_grid: "MortarMayhem-Grid-v0",
-    mortar_mayhem_b: "MortarMayhemB-v0",
-    mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
-    endless_mortar_mayhem: "Endless-MortarMayhem-v0",
-    mystery_path: "MysteryPath-v0",
-    mystery_path_grid: "MysteryPath-Grid-v0",
-    endless_mystery_path: "Endless-MysteryPath-v0",
-    searing_spotlights: "SearingSpotlights-v0",
-    endless_searing_spotlights: "Endless-SearingSpotlights-v0",
-}
+memory_gym_ids!(traces);
 
 /// Shows that a replay finds the differences in a wrong trace.
 #[test]

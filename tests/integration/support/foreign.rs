@@ -6,12 +6,14 @@ use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym::batch::{Block, LAYOUT_VERSION};
-use endless_gym::service::{Namespace, ServiceSpecification};
+use endless_gym::service::{Namespace, Observer, ServiceSpecification};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::header::publish_subscribe::Header;
+
+use super::place::Place;
 
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(transparent)]
@@ -38,13 +40,6 @@ pub struct RequestHeader {
     pub bytes: u64,
     pub process: u32,
     pub held: u32,
-}
-
-impl RequestHeader {
-    pub fn reset_all(specification: &ServiceSpecification) -> Self {
-        let (layout_version, incarnation) = (LAYOUT_VERSION, specification.incarnation);
-        RequestHeader { layout_version, kind: 2, incarnation, trainer: 42, request: 1, ..RequestHeader::default() }
-    }
 }
 
 #[derive(Clone, Copy, Debug, Default, ZeroCopySend)]
@@ -85,25 +80,30 @@ fn service_name(specification: &ServiceSpecification, what: &str) -> ServiceName
 pub struct Foreign {
     publisher: Publisher<ipc::Service, [PayloadBlock], RequestHeader>,
     subscriber: Subscriber<ipc::Service, [PayloadBlock], ResponseHeader>,
-    blocks: usize,
+    pub specification: ServiceSpecification,
     _node: Node<ipc::Service>,
 }
 
 impl Foreign {
-    pub fn new(namespace: &Namespace, specification: &ServiceSpecification) -> Self {
-        let node = node(namespace);
-        let name = |what| service_name(specification, what);
+    /// The trainer of the engine `gym`, and the header of a request that resets all environments.
+    pub fn of(place: &Place) -> (Self, RequestHeader) {
+        let specification = place.trainer("gym").unwrap().specification().clone();
+        let node = node(place.namespace());
+        let name = |what| service_name(&specification, what);
         let blocks = specification.action.blocks();
         let act =
             node.service_builder(&name("act")).publish_subscribe::<[PayloadBlock]>().user_header::<RequestHeader>();
         let publisher = act.open().unwrap().publisher_builder().initial_max_slice_len(blocks).create().unwrap();
         let obs = node.service_builder(&name("obs")).publish_subscribe::<[PayloadBlock]>().user_header();
         let subscriber = obs.open().unwrap().subscriber_builder().create().unwrap();
-        Foreign { publisher, subscriber, blocks, _node: node }
+        let (layout_version, incarnation) = (LAYOUT_VERSION, specification.incarnation);
+        let header =
+            RequestHeader { layout_version, kind: 2, incarnation, trainer: 42, request: 1, ..Default::default() };
+        (Foreign { publisher, subscriber, specification, _node: node }, header)
     }
 
     pub fn blocks(&self) -> usize {
-        self.blocks
+        self.specification.action.blocks()
     }
 
     /// A request with a payload of zeros.
@@ -125,7 +125,7 @@ impl Foreign {
     /// Sends a request, and overwrites its header and payload with `words` until the engine answers or 20 milliseconds
     /// have passed, long enough for the engine to read them several times.
     pub fn ask_while_changing(&self, header: RequestHeader, mut words: impl FnMut() -> u64) {
-        let mut message = self.loan(header, self.blocks);
+        let mut message = self.loan(header, self.blocks());
         let mut memory = SharedWords::of(message.user_header_mut());
         let mut payload = SharedWords::of(message.payload_mut());
         message.send().unwrap();
@@ -255,6 +255,17 @@ impl Engine {
         assert_eq!(message.send().unwrap(), 1);
         header
     }
+}
+
+/// An engine with the specification of one of `num_envs` environments, and its observer.
+pub fn observed(num_envs: usize) -> (Place, Engine, Observer) {
+    let place = Place::new();
+    let model = place.engine("model", num_envs, 1);
+    let specification = place.trainer("model").unwrap().specification().clone();
+    model.end();
+    let engine = Engine::new(place.namespace(), "foreign", &specification);
+    let observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
+    (place, engine, observer)
 }
 
 /// A specification, published like an engine's until this is dropped.

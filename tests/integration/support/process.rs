@@ -1,8 +1,9 @@
 //! Child processes of tests, and waiting for them.
 
 use std::fs::File;
-use std::io::Read;
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::path::Path;
+use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
@@ -106,6 +107,33 @@ fn read(pipe: Option<impl Read>) -> String {
     let mut text = String::new();
     pipe.unwrap().read_to_string(&mut text).unwrap();
     text
+}
+
+/// A program that answers each line of JSON with another.
+pub struct Answering {
+    _process: Process,
+    requests: ChildStdin,
+    answers: BufReader<ChildStdout>,
+}
+
+impl Answering {
+    /// Starts a script in the Python that the environment variable names.
+    pub fn start(variable: &str, script: &Path, arguments: &[&str]) -> Self {
+        let python =
+            std::env::var(variable).unwrap_or_else(|_| panic!("run `cargo xtask test --all`, or set {variable}"));
+        let mut command = Command::new(python);
+        command.arg(script).args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut process = Process::spawn(&mut command);
+        let (requests, answers) = (process.0.stdin.take().unwrap(), process.0.stdout.take().unwrap());
+        Answering { _process: process, requests, answers: BufReader::new(answers) }
+    }
+
+    pub fn ask<T: serde::de::DeserializeOwned>(&mut self, request: &serde_json::Value) -> T {
+        writeln!(self.requests, "{request}").unwrap();
+        let mut line = String::new();
+        self.answers.read_line(&mut line).unwrap();
+        serde_json::from_str(&line).unwrap_or_else(|error| panic!("{request}: the answer is `{line:.300}`: {error}"))
+    }
 }
 
 /// Both ends of a pseudo-terminal: the terminal emulator's, and that of the program in it.

@@ -23,6 +23,14 @@ const ROLE: &str = "ENDLESS_TEST_ROLE";
 pub const ROLE_ARGUMENTS: [&str; 4] = ["role", "--exact", "--ignored", "--nocapture"];
 
 impl Place {
+    /// A namespace with an engine `gym` in a child process, and its trainer.
+    pub fn started(num_envs: usize, groups: usize) -> (Place, Process, Trainer) {
+        let place = Place::new();
+        let engine = place.engine("gym", num_envs, groups);
+        let trainer = place.trainer("gym").unwrap();
+        (place, engine, trainer)
+    }
+
     /// Starts an engine in a child process.
     pub fn engine(&self, service: &str, num_envs: usize, groups: usize) -> Process {
         self.role(&format!("engine {service} {num_envs} {groups}"))
