@@ -179,7 +179,7 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
     use super::*;
     use crate::namespace::directory::Namespace;
@@ -231,13 +231,14 @@ mod tests {
             }
         });
         // An event that no group has wakes any waiter.
-        let polls = AtomicUsize::new(0);
-        let poll = || Ok((polls.fetch_add(1, Ordering::SeqCst) == 2).then_some(()));
+        let rung = AtomicBool::new(false);
+        let poll = || Ok(rung.load(Ordering::SeqCst).then_some(()));
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| doorbell.wait(&(0..1), long, past, &poll).unwrap());
             while !doorbell.parked().has_leader {
                 std::thread::yield_now();
             }
+            rung.store(true, Ordering::SeqCst);
             ports::notify(&notifier, 3);
             assert_eq!(waiting.join().unwrap(), Some(()));
         });
