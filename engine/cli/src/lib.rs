@@ -1,5 +1,7 @@
 //! The command line program `endless`, as a library: the binary of the crate `endless-gym` and the Python package both run [`main`].
 
+#![expect(clippy::missing_errors_doc, reason = "one line says what a section would")]
+
 mod commands;
 mod engine_process;
 mod failure;

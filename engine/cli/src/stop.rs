@@ -85,11 +85,7 @@ fn prepare_exit() {
 pub struct Watchdog(#[expect(dead_code, reason = "held until it is dropped")] Arc<()>);
 
 /// Calls `end`, which does not return if it ends the process, when the flag has been set for [`GRACE`] and `stuck` says that one
-/// piece of work has taken as long, and what it is.
-///
-/// # Errors
-///
-/// A thread cannot be started.
+/// piece of work has taken as long, and what it is. Fails if a thread cannot be started.
 pub fn watch(
     stop: &'static AtomicBool,
     stuck: impl Fn(Duration) -> Option<String> + Send + 'static,
@@ -125,11 +121,7 @@ pub fn wait(stop: &AtomicBool, time: Duration) -> bool {
 
 /// Sets the flag when the parent process requests it or ends: on a byte on standard input, when it closes, or when
 /// `parent` is no longer this process's parent. Standard input alone would not do, since other children that the parent
-/// has forked keep it open.
-///
-/// # Errors
-///
-/// A thread cannot be started.
+/// has forked keep it open. Fails if a thread cannot be started.
 pub fn with_parent(stop: &'static AtomicBool, parent: Option<u32>) -> Result<(), Failure> {
     let thread = |name: &str| std::thread::Builder::new().name(name.to_owned());
     let input = thread("input").spawn(move || {

@@ -32,21 +32,13 @@ impl AdamW {
         (&self.mean, &self.square, self.updates)
     }
 
-    /// The optimizer in a state that [`state`](Self::state) returned.
-    ///
-    /// # Panics
-    ///
-    /// The lengths of m and v differ.
+    /// The optimizer in a state that [`state`](Self::state) returned. Panics if the lengths of m and v differ.
     pub fn from_state(mean: Vec<f32>, square: Vec<f32>, updates: i32) -> Self {
         assert_eq!(mean.len(), square.len());
         AdamW { mean, square, updates }
     }
 
-    /// Updates the parameters.
-    ///
-    /// # Panics
-    ///
-    /// The lengths differ from that in [`new`](Self::new).
+    /// Updates the parameters. Panics if the lengths differ from that in [`new`](Self::new).
     pub fn update(&mut self, parameters: &mut [f32], gradients: &[f32], learning_rate: f64) {
         assert_eq!((parameters.len(), gradients.len()), (self.mean.len(), self.mean.len()));
         self.updates += 1;

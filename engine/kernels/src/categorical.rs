@@ -14,11 +14,8 @@ pub fn log_softmax(logits: &mut [f32], choices: &[usize]) {
     }
 }
 
-/// The log-probabilities of the actions taken, `taken` (M, B).
-///
-/// # Panics
-///
-/// An action is not among the choices, or the shapes do not fit.
+/// The log-probabilities of the actions taken, `taken` (M, B). Panics if an action is not among the choices, or the
+/// shapes do not fit.
 pub fn log_prob(log_probs: &[f32], choices: &[usize], actions: &[usize], taken: &mut [f32]) {
     for (i, (start, size)) in starts(log_probs.len(), choices).enumerate() {
         taken[i] = log_probs[start..start + size][actions[i]];
@@ -34,10 +31,6 @@ pub fn entropy(log_probs: &[f32], choices: &[usize], entropy: &mut [f32]) {
 
 /// Takes the choice with the largest sum of log-probability and noise in each branch. With independent noise from [`gumbel`], it is a
 /// sample of the policy (the Gumbel-max trick); without noise, the most likely choice.
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn sample(log_probs: &[f32], choices: &[usize], noise: Option<&[f32]>, actions: &mut [usize]) {
     for (action, (start, size)) in actions.iter_mut().zip(starts(log_probs.len(), choices)) {
         let score = |i: usize| log_probs[start + i] + noise.map_or(0.0, |noise| noise[start + i]);
@@ -57,10 +50,6 @@ pub fn gumbel(u: f32) -> f32 {
 /// ```text
 /// dx_i = g ([i = a] - p_i) - h p_i (l_i + H)
 /// ```
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn backward(
     log_probs: &[f32],
     choices: &[usize],

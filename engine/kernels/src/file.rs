@@ -63,11 +63,8 @@ struct Versioned {
     version: u32,
 }
 
-/// Reads a file. Weights of other programs have neither a header nor a checksum.
-///
-/// # Errors
-///
-/// [`FileError`] if the file is damaged or of another version.
+/// Reads a file. Weights of other programs have neither a header nor a checksum. Fails with [`FileError`] if the file
+/// is damaged or of another version.
 // Inline, so that the page's copy is compiled with the page's options: small instead of fast.
 #[inline]
 pub fn read(content: &[u8]) -> Result<File<'_>, FileError> {
@@ -98,11 +95,7 @@ pub fn read(content: &[u8]) -> Result<File<'_>, FileError> {
 
 /// Makes a file with a header, which has the entry `"version"` with [`VERSION`].
 ///
-/// The tensors must have different names.
-///
-/// # Errors
-///
-/// [`SafeTensorError`] if a view's data do not fit its shape.
+/// The tensors must have different names. Fails with [`SafeTensorError`] if a view's data do not fit its shape.
 pub fn write(header: String, tensors: Vec<(String, TensorView<'_>)>) -> Result<Vec<u8>, SafeTensorError> {
     let sum = checksum(VERSION, &header, &tensors);
     let metadata = [(HEADER.to_owned(), header), (CHECKSUM.to_owned(), sum)];

@@ -33,10 +33,6 @@ pub const SAVED: usize = 5;
 /// - `state`: hidden states before the first steps, (S, H)
 /// - `saved`: overwritten, (M, 5 H)
 /// - `outputs`: overwritten with the hidden states, (M, H)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 #[allow(clippy::too_many_arguments)]
 pub fn forward(
     sequences: Sequences,
@@ -98,10 +94,6 @@ fn unit_forward(input: &[f32], recurrent: &[f32], saved: &mut [f32], output: &mu
 /// - `grad_outputs`: gradients of the outputs, (M, H)
 /// - `grad_inputs`: overwritten with the gradients of the projected inputs, (M, 3 H)
 /// - `grad_state`: overwritten with the gradients of the states before the first steps, (S, H)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 #[allow(clippy::too_many_arguments)]
 pub fn backward(
     sequences: Sequences,

@@ -10,10 +10,6 @@
 pub const EPSILON: f32 = 1e-5;
 
 /// Computes the outputs `y` (M, N), and saves `u` (M, N) and `s` (M,) for [`backward`].
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn forward(x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], u: &mut [f32], s: &mut [f32]) {
     let width = weight.len();
     let rows = x.chunks_exact(width).zip(y.chunks_exact_mut(width)).zip(u.chunks_exact_mut(width)).zip(s);
@@ -33,10 +29,6 @@ pub fn forward(x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], u: &mut [
 /// ```text
 /// du = dy w       dx = s (du - mean(du) - u mean(du u))       dw += sum of dy u       db += sum of dy
 /// ```
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn backward(
     weight: &[f32],
     u: &[f32],

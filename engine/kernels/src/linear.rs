@@ -8,20 +8,12 @@ use crate::vectors::vectorised;
 /// Computes the outputs.
 ///
 /// `weight` is packed from the transposed matrix: `packed.pack(Matrix::new(weight, I).t())`.
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn forward(x: &[f32], weight: &Packed, bias: &[f32], y: &mut [f32]) {
     product_plus_row(y, bias, Matrix::new(x, weight.rows()), weight);
 }
 
 /// Computes the gradient of the inputs, and adds those of weight and bias to `grad_weight` and `grad_bias`:
 /// `dx = dy W`, `dW += dy^T x`, `db += sum of the rows of dy`. Where no gradient of the inputs is needed, `grad_x` is `None`.
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn backward(
     x: &[f32],
     weight: &[f32],

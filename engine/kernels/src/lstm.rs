@@ -32,10 +32,6 @@ pub const SAVED: usize = 7;
 /// - `saved`: overwritten, (M, 7 H)
 /// - `outputs`: overwritten with the hidden states, (M, H)
 /// - `cells`: overwritten with the cell states, (M, H)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 #[allow(clippy::too_many_arguments)]
 pub fn forward(
     sequences: Sequences,
@@ -106,10 +102,6 @@ fn unit_forward(gates: &[f32], saved: &mut [f32], output: &mut [f32], cell: &mut
 /// - `grad_outputs`: gradients of the outputs, (M, H)
 /// - `grad_inputs`: overwritten with the gradients of the projected inputs, (M, 4 H)
 /// - `grad_hidden`, `grad_cell`: overwritten with the gradients of the states before the first steps, (S, H)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 #[allow(clippy::too_many_arguments)]
 pub fn backward(
     sequences: Sequences,

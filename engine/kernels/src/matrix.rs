@@ -30,11 +30,7 @@ pub struct Matrix<'a> {
 }
 
 impl<'a> Matrix<'a> {
-    /// A matrix with so many columns, row by row.
-    ///
-    /// # Panics
-    ///
-    /// The numbers do not fill the rows.
+    /// A matrix with so many columns, row by row. Panics if the numbers do not fill the rows.
     pub fn new(data: &'a [f32], columns: usize) -> Self {
         assert_eq!(data.len() % columns, 0, "{} numbers do not fill rows of {columns}", data.len());
         Matrix { data, rows: data.len() / columns, columns, row_stride: columns, column_stride: 1 }
@@ -123,21 +119,14 @@ enum Start<'a> {
     Result,
 }
 
-/// Computes the product of `left` (M, K) and `right` (K, N), (M, N).
-///
-/// # Panics
-///
-/// The shapes do not fit, or K is 0.
+/// Computes the product of `left` (M, K) and `right` (K, N), (M, N). Panics if the shapes do not fit, or K is 0.
 pub fn product(result: &mut [f32], left: Matrix, right: &Packed) {
     assert_ne!(right.rows, 0);
     compute(result, Start::Zeros, left, right);
 }
 
-/// Computes the product of `left` (M, K) and `right` (K, N), with `row` (N,) added to each row, (M, N).
-///
-/// # Panics
-///
-/// The shapes do not fit, or K is 0.
+/// Computes the product of `left` (M, K) and `right` (K, N), with `row` (N,) added to each row, (M, N). Panics if the
+/// shapes do not fit, or K is 0.
 pub fn product_plus_row(result: &mut [f32], row: &[f32], left: Matrix, right: &Packed) {
     assert_eq!(row.len(), right.columns);
     assert_ne!(right.rows, 0);
@@ -145,10 +134,6 @@ pub fn product_plus_row(result: &mut [f32], row: &[f32], left: Matrix, right: &P
 }
 
 /// Adds the product of `left` (M, K) and `right` (K, N) to `sum` (M, N).
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn add_product(sum: &mut [f32], left: Matrix, right: &Packed) {
     compute(sum, Start::Result, left, right);
 }

@@ -25,10 +25,6 @@ pub const SAVED: usize = 2;
 /// - `state`: hidden states before the first steps, (S, H)
 /// - `saved`: overwritten, (M, 2 H)
 /// - `outputs`: overwritten with the hidden states, (M, H)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn forward(sequences: Sequences, inputs: &[f32], state: &[f32], saved: &mut [f32], outputs: &mut [f32]) {
     let Some(width) = state.len().checked_div(sequences.count()) else { return };
     for step in sequences.steps() {
@@ -65,10 +61,6 @@ fn unit_forward(input: &[f32], saved: &mut [f32], output: &mut [f32]) {
 /// - `grad_outputs`: gradients of the outputs, (M, H)
 /// - `grad_inputs`: overwritten with the gradients of the projected inputs, (M, 2 H)
 /// - `grad_state`: overwritten with the gradients of the states before the first steps, (S, H)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn backward(
     sequences: Sequences,
     inputs: &[f32],

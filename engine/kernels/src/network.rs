@@ -229,14 +229,7 @@ impl Pass {
 }
 
 impl Network {
-    /// A network with the numbers that `weights` gives for each tensor, in the order of the parameters.
-    ///
-    /// # Errors
-    ///
-    /// Those of `weights`.
-    ///
-    /// # Panics
-    ///
+    /// A network with the numbers that `weights` gives for each tensor, in the order of the parameters. Panics if
     /// `weights` gives a tensor another number of numbers.
     pub fn new<E>(spec: NetworkSpec, mut weights: impl FnMut(&Tensor) -> Result<Vec<f32>, E>) -> Result<Self, E> {
         let mut tensors = Tensors::default();

@@ -4,11 +4,7 @@
 /// columns if there are more rows than columns.
 ///
 /// Gram and Schmidt's method, which gives the factor Q of the QR decomposition with a positive diagonal of R. It runs twice, since once
-/// loses orthogonality by rounding (Giraud et al., 2005).
-///
-/// # Panics
-///
-/// The numbers do not fill the columns.
+/// loses orthogonality by rounding (Giraud et al., 2005). Panics if the numbers do not fill the columns.
 pub fn orthogonal(weight: &mut [f32], columns: usize, gain: f32) {
     assert_eq!(weight.len() % columns, 0);
     let rows = weight.len() / columns;

@@ -12,10 +12,6 @@ use std::cmp::Ordering;
 /// - `log_probs`, `old_log_probs`: log-probabilities of the actions under the current policy and the one that acted, (M, B)
 /// - `advantages`: (M,)
 /// - `grad`: overwritten with the gradient of `log_probs`, (M, B)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn policy_loss(
     log_probs: &[f32],
     old_log_probs: &[f32],
@@ -45,10 +41,6 @@ pub fn policy_loss(
 /// - `values`, `old_values`: current estimates, and those while acting, (M,)
 /// - `returns`: targets R, (M,)
 /// - `grad`: overwritten with the gradient of `values`, (M,)
-///
-/// # Panics
-///
-/// The shapes do not fit.
 pub fn value_loss(values: &[f32], old_values: &[f32], returns: &[f32], clip_range: f32, grad: &mut [f32]) -> f32 {
     let count = values.len() as f64;
     let mut sum = 0.0;

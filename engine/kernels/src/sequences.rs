@@ -18,10 +18,7 @@ impl<'a> Sequences<'a> {
     /// So many sequences, S, with as many steps as `resets` (M,) has rows.
     ///
     /// `resets` marks steps at which an episode starts: the state before such a step is 0, and no gradient passes it.
-    ///
-    /// # Errors
-    ///
-    /// Says what is wrong if the number of resets is not a multiple of the number of sequences.
+    /// Fails with what is wrong if the number of resets is not a multiple of the number of sequences.
     pub fn new(count: usize, resets: &'a [bool]) -> Result<Self, String> {
         if !resets.len().is_multiple_of(count) {
             let given = resets.len();

@@ -38,11 +38,8 @@ struct Header {
     settings: Settings,
 }
 
-/// Writes a checkpoint as the last one of a run, atomically, and with `keep` also under the number of its update.
-///
-/// # Errors
-///
-/// [`Error::File`], as on a full disk; the former checkpoint stays the last one.
+/// Writes a checkpoint as the last one of a run, atomically, and with `keep` also under the number of its update. Fails
+/// with [`Error::File`], as on a full disk; the former checkpoint stays the last one.
 pub fn save(
     run: &Path,
     settings: &Settings,
@@ -112,11 +109,8 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// Reads a checkpoint file, or the last checkpoint of the run in a folder.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Checkpoint`] if there is none.
+    /// Reads a checkpoint file, or the last checkpoint of the run in a folder. Fails with [`Error::Checkpoint`] if
+    /// there is none.
     pub fn read(path: &Path) -> Result<Self, Error> {
         let path = if path.is_dir() { path.join(FOLDER).join(LAST) } else { path.to_owned() };
         if !path.exists() && path.with_extension("pt").exists() {
@@ -156,11 +150,9 @@ impl Checkpoint {
         Ok(header)
     }
 
-    /// Checks that the checkpoint is of a run with these settings and has weights of these sizes, before a network takes memory for them.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Checkpoint`] or [`Error::Json`] if it is damaged, and [`Error::Settings`] if it is of another run.
+    /// Checks that the checkpoint is of a run with these settings and has weights of these sizes, before a network
+    /// takes memory for them. Fails with [`Error::Checkpoint`] or [`Error::Json`] if it is damaged, and
+    /// [`Error::Settings`] if it is of another run.
     pub fn check(&self, settings: &Settings) -> Result<(), Error> {
         settings.check_resumable(&self.header(self.tensors()?.1)?.settings)?;
         let hidden = if settings.agent == Agent::None { 1 } else { settings.recurrence.hidden_size };
@@ -212,11 +204,7 @@ impl Checkpoint {
     }
 
     /// Sets weights and optimizer of a run with the same settings. Returns the number of updates and of steps so far, and the state
-    /// of the environments.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Checkpoint`] if it does not fit.
+    /// of the environments. Fails with [`Error::Checkpoint`] if it does not fit.
     pub fn resume(
         &self,
         network: &mut Network,
@@ -253,11 +241,7 @@ impl Checkpoint {
     }
 
     /// Copies weights into a new network; the encoder and the heads keep theirs where shapes differ. Returns a line of text that says
-    /// which weights were copied.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Checkpoint`] if the memories or the layers after them differ.
+    /// which weights were copied. Fails with [`Error::Checkpoint`] if the memories or the layers after them differ.
     pub fn start(&self, network: &mut Network) -> Result<String, Error> {
         let missing = self.load_weights(&self.tensors()?.0, network, false)?;
         let (all, path) = (network.tensors.len(), self.path.display());

@@ -38,10 +38,7 @@ enum Stepping {
     Served { trainer: Box<Trainer>, latest: Vec<Option<BatchLease>> },
 }
 
-/// The configuration of the first group's pool, which is also that of an engine with these environments.
-///
-/// # Errors
-///
+/// The configuration of the first group's pool, which is also that of an engine with these environments. Fails with
 /// [`Error::Unsupported`], or an unknown id or reset parameter.
 pub fn pool_config(registry: &Registry, settings: &Settings) -> Result<PoolConfig, Error> {
     let spec = registry.spec(&settings.env).map_err(PoolError::from)?;
@@ -76,10 +73,6 @@ fn check(spec: &EnvSpec) -> Result<(), Error> {
 
 impl Environments {
     /// Environments in this process, stepped by its threads.
-    ///
-    /// # Errors
-    ///
-    /// Those of [`pool_config`], and of the pools.
     pub fn in_process(registry: &Registry, settings: &Settings) -> Result<Self, Error> {
         let (config, wanted) = (pool_config(registry, settings)?, &settings.environment);
         let threads = Threads::new(wanted.num_threads)?;
@@ -95,11 +88,8 @@ impl Environments {
         Self::new(spec, settings, Stepping::InProcess(pools))
     }
 
-    /// The environments of an engine, as many as the settings say. The engine describes them, so the program need not have them.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Settings`] if it serves others, and [`Error::Unsupported`].
+    /// The environments of an engine, as many as the settings say. The engine describes them, so the program need not
+    /// have them. Fails with [`Error::Settings`] if it serves others, and [`Error::Unsupported`].
     pub fn served(settings: &Settings, trainer: Trainer) -> Result<Self, Error> {
         let (served, wanted) = (trainer.specification(), &settings.environment);
         let spec = served::spec(served)?;
@@ -142,10 +132,6 @@ impl Environments {
     }
 
     /// Starts an episode in every environment of a group; [`receive`](Self::receive) returns the first observations.
-    ///
-    /// # Errors
-    ///
-    /// Those of pools and trainers.
     pub fn reset(&mut self, group: usize) -> Result<(), Error> {
         match &mut self.place {
             Stepping::InProcess(pools) => {
@@ -161,10 +147,6 @@ impl Environments {
     }
 
     /// Starts a step of a group, whose last result is then gone. In this process it is also done.
-    ///
-    /// # Errors
-    ///
-    /// Those of pools and trainers.
     pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), Error> {
         match &mut self.place {
             Stepping::InProcess(pools) => {
@@ -180,10 +162,6 @@ impl Environments {
     }
 
     /// Waits for the answer to the last request to a group.
-    ///
-    /// # Errors
-    ///
-    /// Those of trainers.
     pub fn receive(&mut self, group: usize) -> Result<(), Error> {
         if let Stepping::Served { trainer, latest } = &mut self.place {
             latest[group] = Some(trainer.receive(group, TIMEOUT)?);
@@ -200,10 +178,6 @@ impl Environments {
     }
 
     /// Snapshots of all environments of all groups.
-    ///
-    /// # Errors
-    ///
-    /// Those of pools and trainers.
     pub fn snapshots(&mut self) -> Result<Vec<Vec<u8>>, Error> {
         let per_group = self.per_group;
         let all = (0..self.groups).flat_map(|group| (0..per_group).map(move |env| (group, env)));
@@ -217,10 +191,6 @@ impl Environments {
 
     /// Continues from snapshots, after [`reset`](Self::reset) of each group; [`receive`](Self::receive) then returns the current
     /// observations.
-    ///
-    /// # Errors
-    ///
-    /// Those of pools and trainers.
     pub fn restore(&mut self, snapshots: &[Vec<u8>]) -> Result<(), Error> {
         let none = vec![EnvReset::Keep; self.per_group];
         for (group, snapshots) in snapshots.chunks(self.per_group).enumerate() {

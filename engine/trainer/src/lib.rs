@@ -16,6 +16,7 @@
 //! weights. Each reads the other's weights.
 
 #![deny(unsafe_code)]
+#![expect(clippy::missing_errors_doc, reason = "one line says what a section would")]
 
 pub mod checkpoint;
 pub mod environments;
@@ -57,10 +58,8 @@ use update::Learner;
 /// - `environments`: makes the environments of the settings, once they are known to be valid
 /// - `stop`: when it is set, the run stops after the current update, with a checkpoint
 ///
-/// # Errors
-///
-/// [`Error`] says what. After [`Error::Diverged`], the last checkpoint is from before. If the environments fail, the run is saved as it
-/// was after the last update, which is [`Error::Saved`].
+/// After [`Error::Diverged`], the last checkpoint is from before. If the environments fail, the run is saved as it was after the last
+/// update, which is [`Error::Saved`].
 pub fn learn(
     settings: &Settings,
     environments: impl FnOnce(&Settings) -> Result<Environments, Error>,

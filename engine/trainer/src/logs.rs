@@ -27,11 +27,8 @@ pub struct Logger {
 
 impl Logger {
     /// Opens the logs of a run of so many updates, of which `update` are done. What follows their rows is cut off: rows of later updates,
-    /// and the part of a row that a killed process wrote.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::File`], and [`Error::Progress`] if a row of these updates is missing.
+    /// and the part of a row that a killed process wrote. Fails with [`Error::File`], and [`Error::Progress`] if a row
+    /// of these updates is missing.
     pub fn open(run: &Path, updates: u64, update: u64) -> Result<Self, Error> {
         let path = run.join(PROGRESS);
         let text = if path.exists() { files::read(&path).map_err(file(&path))? } else { Vec::new() };
@@ -51,10 +48,6 @@ impl Logger {
     }
 
     /// Logs one update.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::File`].
     pub fn update(
         &mut self,
         update: u64,
@@ -85,10 +78,6 @@ impl Logger {
     }
 
     /// Waits until the rows are on disk. A checkpoint must not outlive the rows of its updates when the machine fails.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::File`].
     pub fn sync(&self) -> Result<(), Error> {
         self.progress.sync_data().map_err(file(&self.path))
     }

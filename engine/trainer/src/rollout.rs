@@ -95,10 +95,6 @@ struct Part {
 
 impl Player {
     /// Starts episodes in all environments.
-    ///
-    /// # Errors
-    ///
-    /// Those of the environments.
     pub fn new(
         settings: &Settings,
         network: &Network,
@@ -132,20 +128,12 @@ impl Player {
     }
 
     /// The state between two segments.
-    ///
-    /// # Errors
-    ///
-    /// Those of the environments.
     pub fn state(&mut self) -> Result<State, Error> {
         self.state.snapshots = self.environments.snapshots()?;
         Ok(self.state.clone())
     }
 
     /// Continues from a state.
-    ///
-    /// # Errors
-    ///
-    /// Those of the environments.
     pub fn restore(&mut self, state: State) -> Result<(), Error> {
         self.environments.restore(&state.snapshots)?;
         self.state = state;
@@ -158,10 +146,6 @@ impl Player {
     }
 
     /// Collects the segment of an update, whose number decides its random numbers.
-    ///
-    /// # Errors
-    ///
-    /// Those of the environments.
     pub fn collect(
         &mut self,
         network: &Network,

@@ -23,11 +23,8 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// Makes the folder of a new run, or opens that of a run to resume, and locks it.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::RunInUse`], [`Error::RunExists`], [`Error::NoRun`], and [`Error::File`].
+    /// Makes the folder of a new run, or opens that of a run to resume, and locks it. Fails with [`Error::RunInUse`],
+    /// [`Error::RunExists`], [`Error::NoRun`], and [`Error::File`].
     pub fn open(settings: &Settings) -> Result<Self, Error> {
         let path = match (&*settings.resume, &*settings.run) {
             ("", "") => new_folder(settings)?,

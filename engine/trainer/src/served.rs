@@ -37,11 +37,9 @@ enum Space {
     Tuple(Vec<Space>),
 }
 
-/// The parts of the specification that a trainer needs. They are kept until the program ends, as those of its own environments are.
-///
-/// # Errors
-///
-/// [`Error::Json`] or [`Error::Settings`] if the engine does not describe its environments.
+/// The parts of the specification that a trainer needs. They are kept until the program ends, as those of its own
+/// environments are. Fails with [`Error::Json`] or [`Error::Settings`] if the engine does not describe its
+/// environments.
 pub(crate) fn spec(served: &ServiceSpecification) -> Result<EnvSpec, Error> {
     let source = format!("the specification of engine `{}`", served.service);
     let described = Described::deserialize(&served.environment).map_err(Error::json(&source))?;

@@ -294,11 +294,7 @@ pub(crate) const MAX_WIDTH: u64 = 16_384;
 const MAX_COUNT: u64 = u32::MAX as u64;
 
 /// The command `learn` with the defaults that the arguments name by `--preset` or `--resume`. Of an option that is given twice, the last
-/// one counts.
-///
-/// # Errors
-///
-/// [`Error::NoRun`] or [`Error::Settings`] if there is no such run to resume.
+/// one counts. Fails with [`Error::NoRun`] or [`Error::Settings`] if there is no such run to resume.
 pub fn with_defaults(mut command: Command, arguments: &[OsString]) -> Result<Command, Error> {
     let set = |command: Command, id: &str, values: Vec<String>| {
         command.mut_arg(id, |argument| argument.required(false).default_values(values))
@@ -351,11 +347,8 @@ fn flat(settings: &Json) -> Vec<(&str, &str, Vec<String>)> {
     parts.collect()
 }
 
-/// Reads the settings of the run in a folder.
-///
-/// # Errors
-///
-/// [`Error::NoRun`], or [`Error::Settings`] for those of another program.
+/// Reads the settings of the run in a folder. Fails with [`Error::NoRun`], or [`Error::Settings`] for those of another
+/// program.
 pub fn read(run: &Path) -> Result<Settings, Error> {
     let path = run.join(SETTINGS);
     if !path.exists() {
@@ -366,11 +359,7 @@ pub fn read(run: &Path) -> Result<Settings, Error> {
 }
 
 impl Settings {
-    /// The reset parameters.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Settings`] if one is not NAME=VALUE with a JSON value.
+    /// The reset parameters. Fails with [`Error::Settings`] if one is not NAME=VALUE with a JSON value.
     pub fn options(&self) -> Result<OptionMap, Error> {
         let parse = |given: &String| {
             let (name, text) = given.split_once('=')?;
@@ -389,11 +378,8 @@ impl Settings {
         if self.agent == Agent::None { 1 } else { self.recurrence.sequence_length.min(self.ppo.steps) }
     }
 
-    /// These settings with the environments of an engine.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Settings`] if its environments differ in their reset parameters.
+    /// These settings with the environments of an engine. Fails with [`Error::Settings`] if its environments differ in
+    /// their reset parameters.
     pub fn of_engine(mut self, served: &ServiceSpecification) -> Result<Self, Error> {
         let [options] = &served.options[..] else {
             let (service, count) = (&served.service, served.options.len());
@@ -407,10 +393,6 @@ impl Settings {
     }
 
     /// These settings with the number of updates; checks what concerns several of them.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Settings`].
     pub fn validated(mut self) -> Result<Self, Error> {
         self.options()?;
         let Settings { environment, recurrence, model, ppo, .. } = &self;
@@ -464,9 +446,6 @@ impl Settings {
     }
 
     /// Checks that a run can be resumed with these settings: network, environments and seed must not change.
-    ///
-    /// # Errors
-    ///
     /// [`Error::Settings`] names the first setting that must not change.
     pub fn check_resumable(&self, before: &Settings) -> Result<(), Error> {
         let json = |settings: &Settings| serde_json::to_value(settings).map_err(Error::json(SETTINGS));

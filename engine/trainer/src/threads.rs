@@ -17,11 +17,7 @@ pub struct Threads {
 }
 
 impl Threads {
-    /// So many threads; 0 for one per core.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Threads`] if they cannot be started.
+    /// So many threads; 0 for one per core. Fails with [`Error::Threads`] if they cannot be started.
     pub fn new(count: usize) -> Result<Self, Error> {
         let count = if count == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { count };
         let build = || ThreadPoolBuilder::new().num_threads(count).thread_name(|i| format!("learner {i}")).build();

@@ -41,11 +41,8 @@ pub struct FilmFile {
 }
 
 impl FilmFile {
-    /// Starts a file of the format that the suffix of `path` names.
-    ///
-    /// # Errors
-    ///
-    /// If the suffix is another one, the folder cannot be written, or ffmpeg does not start.
+    /// Starts a file of the format that the suffix of `path` names. Fails if the suffix is another one, the folder
+    /// cannot be written, or ffmpeg does not start.
     pub fn create(path: &Path, shape: Shape) -> Result<Self, Failure> {
         let suffix = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         if !["webp", "mp4"].contains(&suffix.as_str()) {
@@ -81,11 +78,8 @@ impl FilmFile {
         })
     }
 
-    /// Adds a picture, RGB pixels in rows, that is shown for `count` picture durations, 1 or more.
-    ///
-    /// # Errors
-    ///
-    /// If the picture cannot be encoded or written.
+    /// Adds a picture, RGB pixels in rows, that is shown for `count` picture durations, 1 or more. Fails if the picture
+    /// cannot be encoded or written.
     pub fn add(&mut self, pixels: &[[u8; 3]], count: u16) -> Result<(), Failure> {
         self.encode(pixels, count).map_err(|error| self.failure(&error))
     }
@@ -140,11 +134,8 @@ impl FilmFile {
         Ok(())
     }
 
-    /// Completes the file and, once it is on disk, renames it to its final name.
-    ///
-    /// # Errors
-    ///
-    /// If the rest of the file cannot be written, or ffmpeg failed.
+    /// Completes the file and, once it is on disk, renames it to its final name. Fails if the rest of the file cannot
+    /// be written, or ffmpeg failed.
     pub fn finish(mut self) -> Result<(), Failure> {
         self.end()
             .and_then(|()| Ok(File::open(&self.partial)?.sync_all()?))
