@@ -10,6 +10,9 @@ import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -46,6 +49,18 @@ def mapping(name: str, given: Any) -> dict[str, Any]:
     if not isinstance(given, Mapping):
         raise TypeError(f"{name} must be a mapping, got {given!r}")
     return dict(given)
+
+
+def flags(name: str, given: Any, count: int) -> NDArray[np.bool_]:
+    """The argument as an array bool (count,).
+
+    Raises:
+        ValueError: It is not such an array.
+    """
+    array = np.asarray(given)
+    if array.dtype != np.bool_ or array.shape != (count,):
+        raise ValueError(f"{name} must be a bool array of shape ({count},), got {array.dtype} {array.shape}")
+    return array
 
 
 def timeout(given: float) -> float:

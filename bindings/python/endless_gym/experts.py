@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.arguments import integer
+from endless_gym.arguments import flags, integer
 from endless_gym.specs import Spec, spec
 
 
@@ -67,9 +67,9 @@ class Experts:
         if any(name not in parts for name in needed):
             raise ValueError(f"observation must have {' and '.join(needed)}, got {', '.join(parts)}")
         arrays = [np.ascontiguousarray(self._numbers(parts[name]), dtype=np.float32) for name in needed]
-        turn = np.where(self._flags("episode_start", episode_start), np.uint8(2), np.uint8(1))
+        turn = np.where(flags("episode_start", episode_start, self.num_envs), np.uint8(2), np.uint8(1))
         if active is not None:
-            turn[~self._flags("active", active)] = 0
+            turn[~flags("active", active, self.num_envs)] = 0
         for name, array in zip(needed, arrays, strict=True):
             columns = len(self._spec.features) if name == "features" else self._spec.vector_observation
             if array.shape != (self.num_envs, columns):
@@ -83,11 +83,3 @@ class Experts:
             return np.concatenate([self._numbers(part) for part in observation], axis=-1)
         is_discrete = self._spec.described_features is not None and np.ndim(observation) == 1
         return np.asarray(observation)[:, None] if is_discrete else observation
-
-    def _flags(self, name: str, given: Any) -> NDArray[np.bool_]:
-        flags = np.asarray(given)
-        if flags.dtype != np.bool_ or flags.shape != (self.num_envs,):
-            raise ValueError(
-                f"{name} must be a bool array of shape ({self.num_envs},), got {flags.dtype} {flags.shape}"
-            )
-        return flags

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.arguments import first_seed, integer
+from endless_gym.arguments import first_seed, flags, integer
 
 Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 
@@ -22,25 +22,19 @@ class ResetRequests:
 
     def envs(self, mask: Any, name: str = "reset_mask") -> Sequence[int]:
         """The numbers of the environments in a mask; all for `None`."""
-        return range(self._num_envs) if mask is None else np.flatnonzero(self._mask(mask, name)).tolist()
+        return range(self._num_envs) if mask is None else np.flatnonzero(flags(name, mask, self._num_envs)).tolist()
 
     def request(self, seed: Seeds, mask: Any, group: int) -> _native.Reset | None:
         """A reset of a group."""
         if mask is None and not _has_items(seed):
             return None if seed is None else self._first_seed(seed)
-        chosen = np.ones(self._num_envs, dtype=np.bool_) if mask is None else self._mask(mask, "reset_mask")
+        chosen = [True] * self._num_envs if mask is None else flags("reset_mask", mask, self._num_envs)
         seeds = self._seeds(seed, group)
         reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
         return reset, [given or 0 for given in seeds]
 
     def _first_seed(self, seed: Any) -> int:
         return first_seed(seed, self._first_env + self._num_groups * self._num_envs)
-
-    def _mask(self, given: Any, name: str) -> NDArray[np.bool_]:
-        mask = np.asarray(given)
-        if mask.dtype != np.bool_ or mask.shape != (self._num_envs,):
-            raise ValueError(f"{name} must be a bool array of shape ({self._num_envs},), got {mask.dtype} {mask.shape}")
-        return mask
 
     def _seeds(self, seed: Seeds, group: int) -> list[int | None]:
         """One seed for each environment of a group."""
