@@ -1,4 +1,4 @@
-"""Write the generated parts of the pages: the tables of the environments, and the messages of errors.
+"""Write the generated parts of the pages: the tables of the environments. `hooks.py` adds the messages of errors to the site.
 
     endless list --json | python docs/generate.py            # writes into the pages
     endless list --json | python docs/generate.py --check    # fails if a page is stale
@@ -87,11 +87,16 @@ def space(described: dict[str, Any]) -> str:
 
 
 def variants(name: str) -> str:
-    """The ids of a family with their spaces."""
-    return table(
-        ["id", "actions", "observation"],
-        ((f"`{each['id']}`", space(each["action_space"]), space(each["observation_space"])) for each in family(name)),
-    )
+    """The ids of a family with their spaces; difficulties with the same spaces share a row."""
+    ids: dict[tuple[str, ...], list[str]] = {}
+    for each in family(name):
+        key = (
+            re.sub("(Easy|Medium|Hard)-", "", each["id"]),
+            space(each["action_space"]),
+            space(each["observation_space"]),
+        )
+        ids.setdefault(key, []).append(f"`{each['id']}`")
+    return table(["ids", "actions", "observation"], ((", ".join(same), *spaces) for (_, *spaces), same in ids.items()))
 
 
 def choices(name: str) -> str:
@@ -191,6 +196,8 @@ def ranges(template: str, names: Sequence[str]) -> str:
     return template.format(*(f"{{{min(place)}..{max(place)}}}" for place in places))
 
 
+#: Where a page lists the messages of error types.
+ERRORS = re.compile(r"<!-- errors: ([\w ]+) -->")
 #: A type that derives `thiserror::Error`: documentation, kind, name, and the rest up to the line that closes it.
 ERROR_TYPE = re.compile(
     r"((?:^///[^\n]*\n)*)^#\[derive\([^)]*\bError\b[^)]*\)\]\n((?:^#\[.*?\]\n)*)^pub (enum|struct) (\w+)(.*?(?:^\}|;$))",
@@ -269,7 +276,6 @@ PARTS = {
     "infos": infos,
     "ground-truth": ground_truth,
     "features": features,
-    "errors": errors,
 }
 
 
@@ -283,10 +289,10 @@ def main() -> None:
         for file, text in pages.items()
     }
     described = " ".join(new.values())
-    # A section, or a row of a table.
-    ways = ("## {}\n", "\n| `{}` |")
-    missing = [spec["id"] for spec in SPECS if not any(way.format(spec["id"]) in described for way in ways)]
-    listed = set(" ".join(re.findall(r"<!-- generated: errors ([\w ]+) -->", described)).split())
+    # A section, or a cell of a table.
+    missing = [spec["id"] for spec in SPECS if not re.search(rf"## {spec['id']}\n|[|,] `{spec['id']}`[ ,]", described)]
+    listed = set(" ".join(ERRORS.findall(described)).split())
+    errors(" ".join(listed & error_types().keys()))
     missing += [name for name, found in error_types().items() if found and name not in listed]
     if missing or (missing := list(HELP.keys() - error_types().keys())):
         raise SystemExit(f"docs/ does not describe, or describes in vain: {', '.join(missing)}")

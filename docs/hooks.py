@@ -1,4 +1,4 @@
-"""MkDocs hooks: pages from elsewhere in the repository, the page that plays and its colours, and a check for external files."""
+"""MkDocs hooks: pages from elsewhere, messages of errors, the page that plays and its colours, and a check for external files."""
 
 import html
 import os
@@ -6,6 +6,7 @@ import re
 import shutil
 from pathlib import Path
 
+import generate
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
@@ -99,6 +100,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     def contents(found: re.Match[str]) -> str:
         return f"```{Path(found[1]).suffix[1:]}\n{(ROOT / found[1]).read_text()}```"
 
+    markdown = generate.ERRORS.sub(lambda found: generate.errors(found[1]), markdown)
     # A link that forms a paragraph by itself is replaced by the file's contents.
     markdown = re.sub(r"^\[([\w/.-]+\.(?:rs|py|yaml|sh))\]\([^)]*\)$", contents, markdown, flags=re.M)
     markdown = re.sub(r"(?<!!)\[([^\]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)", link, markdown)
