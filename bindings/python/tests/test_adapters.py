@@ -58,22 +58,6 @@ class TestStableBaselines3:
         self.make = EndlessVecEnv.make
         self.adapt = EndlessVecEnv
 
-    @pytest.mark.parametrize("env_id", IDS)
-    def test_arrays_have_the_shapes_and_dtypes_of_the_spaces(self, env_id):
-        venv = self.make(env_id, num_envs=5)
-        venv.seed(3)
-        obs = venv.reset()
-        assert (obs.shape, obs.dtype) == ((5, *FRAME), np.uint8)
-        assert venv.observation_space.contains(obs[0])
-        assert len(venv.reset_infos) == 5
-        obs, rewards, dones, infos = venv.step(random_actions(venv, np.random.default_rng(0), 5))
-        assert (obs.shape, obs.dtype) == ((5, *FRAME), np.uint8)
-        assert (rewards.shape, rewards.dtype) == ((5,), np.float32)
-        assert (dones.shape, dones.dtype) == ((5,), np.bool_)
-        assert [type(info) for info in infos] == [dict] * 5
-        rewards += 1  # on-policy algorithms add to the rewards of episodes that were cut off
-        venv.close()
-
     def test_infos_of_ended_episodes_match_those_of_monitor(self):
         num_envs, rng = 8, np.random.default_rng(1)
         envs, obs = reference(SHORT, num_envs, "disabled", seed=11)
@@ -117,6 +101,9 @@ class TestStableBaselines3:
                 np.testing.assert_array_equal(obs, following)
             total[done], length[done] = 0, 0
         assert ended >= num_envs
+        assert (obs.dtype, rewards.dtype, dones.dtype) == (np.uint8, np.float32, np.bool_)
+        assert venv.observation_space.contains(obs[0]) and len(venv.reset_infos) == num_envs
+        rewards += 1  # on-policy algorithms add to the rewards of episodes that were cut off
         venv.close()
         envs.close()
 
@@ -339,25 +326,6 @@ class TestPufferLib:
 
         self.env = EndlessPufferEnv
 
-    @pytest.mark.parametrize("env_id", IDS)
-    def test_arrays_have_the_shapes_and_dtypes_of_the_spaces(self, env_id):
-        env = self.env(env_id, num_envs=4)
-        assert env.num_agents == 4
-        assert not env.emulated
-        assert not env.done
-        assert env.driver_env is env
-        obs, infos = env.reset(seed=0)
-        assert obs.shape == env.observation_space.shape == (4, *FRAME)
-        assert infos == []
-        obs, rewards, terminals, truncations, infos = env.step(random_actions(env, np.random.default_rng(0), 4))
-        assert (obs.shape, obs.dtype) == ((4, *FRAME), np.uint8)
-        assert (rewards.shape, rewards.dtype) == ((4,), np.float32)
-        assert terminals.shape == truncations.shape == (4,)
-        assert terminals.dtype == truncations.dtype == np.bool_
-        assert env.masks.all()
-        assert isinstance(infos, list)
-        env.close()
-
     @pytest.mark.parametrize("buffers", [False, True])
     def test_steps_equal_those_of_the_vector_environment(self, buffers):
         num_envs, rng = 6, np.random.default_rng(4)
@@ -373,7 +341,10 @@ class TestPufferLib:
                 "actions": np.zeros((num_envs, 2), np.int32),
             }
         env = self.env(SHORT, num_envs=num_envs, buf=buf)
-        np.testing.assert_array_equal(env.reset(seed=3)[0], obs)
+        assert (env.num_agents, env.emulated, env.done, env.driver_env) == (num_envs, False, False, env)
+        given, infos = env.reset(seed=3)
+        np.testing.assert_array_equal(given, obs)
+        assert given.shape == env.observation_space.shape and infos == []
         ended = 0
         for _ in range(150):
             actions = random_actions(env, rng, num_envs)
@@ -400,6 +371,8 @@ class TestPufferLib:
             else:
                 assert infos == []
         assert ended >= num_envs
+        assert (got.dtype, rewards.dtype) == (np.uint8, np.float32)
+        assert terminals.dtype == truncations.dtype == np.bool_
         env.close()
         envs.close()
 

@@ -221,8 +221,3 @@ def test_the_program_says_what_to_do(arguments: str, message: str, tmp_path: Pat
     command = [*program(), *arguments.split()]
     ran = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
     assert message in ran.stderr and bool(ran.stderr) == bool(message) == bool(ran.returncode)
-
-
-def test_a_text_is_no_list_of_seeds() -> None:
-    with pytest.raises(TypeError, match="seed must be an integer, got 'a'"):
-        endless_gym.make_vec("MysteryPath-Grid-v0", 4).reset(seed="a")

@@ -12,7 +12,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from support import await_end_of_engines, segments, stop
+from support import segments, stop
 
 import endless_gym
 
@@ -133,22 +133,6 @@ threading.Thread(target=lambda envs: threading.Event().wait(), args=[envs], daem
 """
     assert subprocess.run([sys.executable, "-c", text], timeout=60).returncode == -signal.SIGKILL
     assert not segments()
-
-
-def test_engines_end_with_the_kernel_of_a_notebook() -> None:
-    """An interactive interpreter, like a kernel, runs three cells and is killed."""
-    kernel = subprocess.Popen([sys.executable, "-i", "-q"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    try:
-        kernel.stdin.write("import endless_gym\n")
-        for _ in range(3):
-            kernel.stdin.write(f"envs = endless_gym.serve({ID!r}, 4)\n")
-            kernel.stdin.write("print(len(endless_gym.running_engines()))\n")
-            kernel.stdin.flush()
-            assert kernel.stdout.readline() == "1\n"
-    finally:
-        kernel.kill()
-        kernel.communicate()
-    await_end_of_engines()
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -76,12 +76,6 @@ def test_gymnasiums_checker_passes(id: str) -> None:
         check_env(gymnasium.make(f"EndlessGym/{id}", render_mode=mode).unwrapped, skip_render_check=True)
 
 
-def test_rgb_array_is_the_observation_by_rows() -> None:
-    env = gymnasium.make("EndlessGym/MysteryPath-v0", render_mode="rgb_array")
-    observation, _ = env.reset(seed=1)
-    np.testing.assert_array_equal(env.render(), observation.swapaxes(0, 1))
-
-
 @pytest.mark.parametrize("id", ["MortarMayhem-v0", "MysteryPath-v0", "SearingSpotlights-v0"])
 def test_a_window_shows_the_ground_truth_view(id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -127,6 +121,8 @@ def test_wrong_arguments_and_calls_raise() -> None:
         env.reset(options={"arena_sise": 2})
     with pytest.raises(ValueError, match="MortarMayhem-v0"):
         endless_gym.Env("Mortar")
+    with pytest.raises(TypeError, match=r"frames must be endless_gym\.Frames or None"):
+        endless_gym.Env("MysteryPath-v0", frames="grayscale")  # type: ignore[arg-type]
 
 
 def test_the_originals_ids_and_classes_make_equal_environments() -> None:
@@ -217,18 +213,6 @@ def test_async_vector_env_plays_as_sync_vector_env(where: str, context: str) -> 
         asynchronous.close()
 
 
-def test_an_environment_can_be_sent_to_a_spawned_worker() -> None:
-    env = endless_gym.Env("MysteryPath-v0")
-    env.reset(seed=1)
-    # The environment itself is pickled, not only its arguments.
-    asynchronous = gymnasium.vector.AsyncVectorEnv([lambda: env] * 2, context="spawn")
-    try:
-        observation, _ = asynchronous.reset(seed=[3, 4])
-        np.testing.assert_array_equal(observation[1], env.reset(seed=4)[0])
-    finally:
-        asynchronous.close()
-
-
 def test_gymnasium_make_accepts_list_render_modes() -> None:
     env = gymnasium.make("EndlessGym/MysteryPath-v0", render_mode="rgb_array_list")
     env.reset(seed=1)
@@ -261,17 +245,6 @@ def test_observations_equal_a_vector_environments(id: str, kwargs: dict[str, Any
             )
             actions = envs.action_space.sample()
             given, wanted = env.step(actions[0])[0], envs.step(actions)[0]
-
-
-def test_impossible_observations_are_refused() -> None:
-    for kwargs, error, match in (
-        ({"observation": "pixels"}, ValueError, "observation must be one of rgb, features"),
-        ({"observation": "features", "frames": endless_gym.Frames()}, ValueError, "has no frames"),
-        ({"frames": "grayscale"}, TypeError, "frames must be endless_gym.Frames or None"),
-        ({"frames": endless_gym.Frames(stack=65)}, ValueError, "1 to 64, got 65"),
-    ):
-        with pytest.raises(error, match=match):
-            endless_gym.Env("MysteryPath-v0", **kwargs)
 
 
 def test_progress_counts_tiles_and_falls() -> None:

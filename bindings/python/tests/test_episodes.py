@@ -122,6 +122,8 @@ def test_wrong_options_change_nothing(where: Callable[..., Envs]) -> None:
             envs.set_options([ONE, 3], group=0)  # type: ignore[list-item]
         with pytest.raises(ValueError, match=r"^mask must be a bool array of shape \(2,\), got bool \(3,\)$"):
             envs.set_options(ONE, mask=np.ones(3, np.bool_))
+        with pytest.raises(ValueError, match=r"^reset_mask must be a bool array of shape \(2,\), got int64 \(2,\)$"):
+            envs.reset(options={"reset_mask": [1, 0]})
         with pytest.raises(ValueError, match=r"^group must be 0 to 1, got 2$"):
             envs.set_options(ONE, group=2)
         envs.reset()

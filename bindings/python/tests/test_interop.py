@@ -34,12 +34,6 @@ def test_torch_shares_the_memory_without_a_warning(observation: np.ndarray) -> N
     np.testing.assert_array_equal(tensor.numpy(), observation)
 
 
-def test_torch_from_numpy_shares_the_memory(observation: np.ndarray) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert torch.from_numpy(observation).data_ptr() == observation.ctypes.data
-
-
 def test_torch_view_takes_every_dtype_and_strided_parts(observation: np.ndarray) -> None:
     envs = endless_gym.make_vec("Endless-MortarMayhem-v0", 4, seed=1)
     envs.reset()
@@ -235,9 +229,7 @@ def test_environments_in_this_process_write_to_memory_of_torch(monkeypatch: pyte
 
 
 def test_unfit_memory_is_refused() -> None:
-    (config,) = checked_arguments(
-        ENDLESS, 2, 1, 1, 1, None, None, "same_step", "rgb", None, False, False, 0, None
-    ).pools
+    given = checked_arguments(ENDLESS, 2, 1, 1, 1, None, None, "same_step", "rgb", None, False, False, 0, None)
     unfit = {
         ValueError: [
             lambda size: torch.zeros(size - 1, dtype=torch.uint8),
@@ -248,7 +240,7 @@ def test_unfit_memory_is_refused() -> None:
     }
     for error, allocations in unfit.items():
         for allocate in allocations:
-            pools = endless_gym._native.Pools([json_text(config)], 1, allocate)
+            pools = endless_gym._native.Pools([json_text(given.pools[0])], 1, allocate)
             with pytest.raises(error):
                 pools.reset(0)
 
@@ -297,7 +289,7 @@ def test_from_dlpack_takes_the_arrays_themselves(where) -> None:
             assert torch.from_dlpack(array).data_ptr() == array.ctypes.data
 
 
-@pytest.mark.parametrize("where", [endless_gym.serve, endless_gym.make_vec])
+@pytest.mark.parametrize("where", WHERE)
 def test_actions_that_numpy_cannot_read_are_refused_with_its_reason(where) -> None:
     zeros = torch.zeros(4)
     tensors = [zeros.to("meta"), zeros.requires_grad_(), torch.zeros(4, dtype=torch.int64).to_sparse()]

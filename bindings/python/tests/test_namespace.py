@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import re
 import shlex
 import subprocess
 import sys
@@ -89,21 +88,11 @@ def test_engines_whose_names_begin_alike_are_told_apart(parent: Path) -> None:
         assert sorted(endless_gym.running_engines()) == sorted(names)
 
 
-@pytest.mark.parametrize(
-    ("limit", "value", "option"),
-    [
-        ("RLIMIT_NOFILE", 12, "ulimit -n"),
-        ("RLIMIT_FSIZE", 0, "ulimit -f"),
-        ("RLIMIT_AS", 0, "ulimit -v|_ArrayMemoryError"),
-    ],
-)
+@pytest.mark.parametrize(("limit", "value", "option"), [("NOFILE", 12, "ulimit -n"), ("FSIZE", 0, "ulimit -f")])
 def test_an_engine_survives_an_observer_that_cannot_attach(limit: str, value: int, option: str, parent: Path) -> None:
-    """The limit of the address space leaves the observer a megabyte, and numpy or the engine's memory needs more than two."""
     text = f"""
-import resource, sys, endless_gym
-used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-value = {value} or (used + 2**20 if {limit!r} == "RLIMIT_AS" else 0)
-resource.setrlimit(resource.{limit}, (value, value))
+import resource, endless_gym
+resource.setrlimit(resource.RLIMIT_{limit}, ({value}, {value}))
 with endless_gym.watch("gym", timeout=5) as batches:
     next(batches)
 """
@@ -115,7 +104,7 @@ with endless_gym.watch("gym", timeout=5) as batches:
         envs.reset(seed=1)
         observer = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=60)
         error = observer.stderr.strip().splitlines()
-        assert observer.returncode == 1 and re.search(option, error[-1]), error
+        assert observer.returncode == 1 and option in error[-1], error
         for _ in range(3):
             envs.step(actions)
     assert not segments()

@@ -332,17 +332,6 @@ def test_experts_check_their_arguments() -> None:
 
 
 def test_the_values_of_a_repeated_flag_accumulate() -> None:
-    repeated = [
-        "MortarMayhem-v0",
-        "--error-rate",
-        "0",
-        "0.1",
-        "--error-rate",
-        "0.2",
-        "--option",
-        "a=1",
-        "--option",
-        "b=2",
-    ]
-    given = _parser().parse_args(repeated)
+    repeated = "MortarMayhem-v0 --error-rate 0 0.1 --error-rate 0.2 --option a=1 --option b=2"
+    given = _parser().parse_args(repeated.split())
     assert (given.error_rates, given.option) == ([0.0, 0.1, 0.2], ["a=1", "b=2"])

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from support import stop
+from support import WHERE, stop
 
 import endless_gym
 
@@ -30,7 +30,6 @@ print(*counts)
 
 ID = "MortarMayhem-Grid-v0"
 ACTIONS = np.array([0, 1, 2, 3])
-WHERE = [endless_gym.serve, endless_gym.make_vec]
 
 
 @pytest.mark.parametrize("where", WHERE)

@@ -126,49 +126,11 @@ def test_free_threaded_builds_are_refused_at_import() -> None:
     assert "\nImportError: endless_gym does not support free-threaded builds of CPython; use one with" in done.stderr
 
 
-@pytest.mark.parametrize("where", WHERE)
-def test_groups_are_stepped_independently(where) -> None:
-    with where(ID, 2, groups=2, seed=3) as envs, where(ID, 4, seed=3) as all_envs:
-        whole, _ = all_envs.reset()
-        for group in range(2):
-            envs.send_reset(group)
-        for group in (1, 0):
-            observation, reward, _, _, info = envs.recv(group)
-            assert info["group"] == group
-            assert not reward.any()
-            np.testing.assert_array_equal(observation, whole[2 * group : 2 * group + 2])
-        with pytest.raises(RuntimeError, match="nothing was sent to group 1"):
-            envs.recv(1)
-        envs.send(np.zeros((2, 2), dtype=np.int64), 1)
-        assert envs.recv()[4]["group"] == 1
-
-
-@pytest.mark.parametrize("where", WHERE)
-def test_reset_takes_options_and_a_mask(where) -> None:
-    with where("MortarMayhem-v0", 3, autoreset="disabled") as envs:
-        usual, _ = envs.reset(seed=1)
-        small, _ = envs.reset(seed=1, options={"arena_size": 2})
-        assert (usual != small).any()
-        assert (envs.reset(seed=1)[0] == usual).all()
-        envs.step(np.ones((3, 2), dtype=np.int64))
-        mask = np.array([False, True, False])
-        envs.reset(options={"reset_mask": mask})
-        mixed, _ = envs.reset(seed=[7, None, None], options={"reset_mask": ~mask})
-        np.testing.assert_array_equal(mixed[0], envs.reset(seed=7)[0][0])
-        with pytest.raises(ValueError, match="reset_mask"):
-            envs.reset(options={"reset_mask": [1, 0]})
-
-
 def test_gymnasiums_make_vec_returns_this_class() -> None:
     envs = gymnasium.make_vec(f"EndlessGym/{ID}", num_envs=8, seed=1, num_threads=1)
     assert isinstance(envs, endless_gym.EndlessVectorEnv)
     observation, _ = envs.reset()
     np.testing.assert_array_equal(observation, endless_gym.make_vec(ID, 8, seed=1).reset()[0])
-    wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
-    with endless_gym.make_vec(ID, 8, seed=1) as plain:
-        same(wrapped.reset(seed=2), plain.reset(seed=2))
-        actions = envs.action_space.sample()
-        same(wrapped.step(actions), plain.step(actions))
 
 
 def transposed(axes: tuple[int, ...]):
