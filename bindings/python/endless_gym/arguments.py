@@ -51,6 +51,22 @@ def mapping(name: str, given: Any) -> dict[str, Any]:
     return dict(given)
 
 
+def mappings(name: str, given: Any, count: int) -> list[dict[str, Any] | None]:
+    """The argument as `count` dicts, from one mapping for all or a sequence with one, or `None`, for each.
+
+    Raises:
+        TypeError: It is neither.
+        ValueError: The sequence has another length.
+    """
+    if isinstance(given, Mapping):
+        return [dict(given)] * count
+    if not isinstance(given, Sequence) or isinstance(given, (str, bytes)):
+        raise TypeError(f"{name} must be a mapping, or a sequence of mappings, got {given!r}")
+    if len(given) != count:
+        raise ValueError(f"{name} must have one mapping for each of {count} environments, got {len(given)}")
+    return [None if each is None else mapping(name, each) for each in given]
+
+
 def flags(name: str, given: Any, count: int) -> NDArray[np.bool_]:
     """The argument as an array bool (count,).
 

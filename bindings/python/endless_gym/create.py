@@ -19,7 +19,6 @@ from endless_gym.requests.configuration import (
     AutoresetName,
     Options,
     checked_arguments,
-    options_list,
 )
 from endless_gym.requests.results import Results
 from endless_gym.specs import Frames, ObservationName, described_spec, json_text
@@ -109,7 +108,7 @@ def make_vec(
         Results(given.described, layout, given.pools[0]["num_envs"], given.frames, given.autoreset, copy),
         episode_options,
         episode_info,
-        options=options_list(options),
+        options=[given.options] if isinstance(given.options, dict) else given.options,
         render_mode=render_mode,
         view=view,
         first_env=first_env,

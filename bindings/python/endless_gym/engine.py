@@ -206,12 +206,11 @@ def serve(
     if checkpoint is not None:
         every = None if checkpoint_every is None else checked_timeout(checkpoint_every)
         saved = {"path": os.fspath(checkpoint), "every_seconds": every, "resume": bool(resume)}
-    given_options = dict(options or {}) if options is None or isinstance(options, Mapping) else [*map(dict, options)]
     batches = integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD)
     config = {
         "service": f"python-{os.getpid()}-{next(_numbers)}",
         # The environments of one group, with the options of all groups.
-        "pool": {**given.pools[0], "options": given_options},
+        "pool": {**given.pools[0], "options": given.options},
         "groups": len(given.pools),
         "threads": given.num_threads,
         "batches_held": min(batches + bool(episode_info) + bool(pin_memory), _native.MAX_BATCHES_HELD),

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import gymnasium
 
 from endless_gym import _native
-from endless_gym.arguments import integer, mapping, seeding
+from endless_gym.arguments import integer, mappings, seeding
 from endless_gym.specs import Frames, ObservationName, Spec, contents, json_text, spec
 
 try:
@@ -50,6 +50,8 @@ class Arguments:
     num_threads: int
     autoreset: AutoresetMode
     frames: Frames | None
+    #: The reset parameters of all environments, or of each one of all groups.
+    options: dict[str, Any] | list[dict[str, Any]]
     #: The configuration of each group, which the engine has checked: the JSON object of its `PoolConfig`.
     pools: list[dict[str, Any]]
 
@@ -85,13 +87,17 @@ def checked_arguments(
     first_env = integer("first_env", first_env, 0, MAX_TOTAL_ENVS)
     end = first_env + groups * num_envs
     total_envs = end if total_envs is None else integer("total_envs", total_envs, end, MAX_TOTAL_ENVS)
+    chosen: dict[str, Any] | list[dict[str, Any]] = {}
+    if options is not None:
+        each = [given or {} for given in mappings("options", options, groups * num_envs)]
+        chosen = each[0] if isinstance(options, Mapping) else each
     source = seeding(seed, seeds, total_envs)
     frames, features = contents(described, observation, frames)
     pools = [
         {
             "id": described.id,
             "num_envs": num_envs,
-            "options": _pool_options(options, group * num_envs, num_envs, groups),
+            "options": chosen if isinstance(chosen, dict) else chosen[group * num_envs :][:num_envs],
             "autoreset": mode.name.lower(),
             "final_observation": True,
             "seeding": source,
@@ -107,7 +113,7 @@ def checked_arguments(
     ]
     for pool in pools:
         described.native.check_pool_config(json_text(pool))
-    return Arguments(described, threads, mode, frames, pools)
+    return Arguments(described, threads, mode, frames, chosen, pools)
 
 
 def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
@@ -116,23 +122,3 @@ def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
     if mode is None:
         raise ValueError(f"autoreset must be one of {', '.join(MODES)}, got {given!r}")
     return mode
-
-
-def options_list(given: Options | Sequence[Options] | None) -> Sequence[Options]:
-    """The reset parameters as a list: one mapping for all environments, or one for each of all groups."""
-    return [given or {}] if given is None or isinstance(given, Mapping) else given
-
-
-def _pool_options(
-    given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int
-) -> Options | Sequence[Options]:
-    """The reset parameters of the environments of one group."""
-    if given is None or isinstance(given, Mapping):
-        return dict(given or {})
-    if not isinstance(given, Sequence) or isinstance(given, str):
-        raise TypeError(f"options must be a mapping, or a sequence of mappings, got {given!r}")
-    if len(given) != groups * num_envs:
-        raise ValueError(
-            f"options must have one mapping for each of {groups * num_envs} environments, got {len(given)}"
-        )
-    return [mapping("options", each) for each in given[first : first + num_envs]]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from endless_gym import _native
-from endless_gym.arguments import mapping
+from endless_gym.arguments import mappings
 from endless_gym.specs import options_text
 
 Options = Mapping[str, Any]
@@ -73,7 +73,7 @@ class NextOptions:
         count = self._num_envs * len(groups)
         # As for seeds, a sequence has one item for each environment of a group, or of all groups.
         repeats = len(groups) if isinstance(options, Sequence) and len(options) == self._num_envs else 1
-        each = _one_for_each(options, count // repeats) * repeats
+        each = mappings("options", options, count // repeats) * repeats
         for place, group in enumerate(groups):
             own = each[place * self._num_envs :][: self._num_envs]
             self.set(group, {env: given for env in envs if (given := own[env]) is not None})
@@ -146,20 +146,3 @@ class NextOptions:
 
     def _number(self, group: int, env: int) -> int:
         return 0 if len(self._created) == 1 else group * self._num_envs + env
-
-
-def _one_for_each(given: Any, count: int) -> list[Options | None]:
-    """The options of `count` environments, from one mapping for all or a sequence with one, or `None`, for each.
-
-    Raises:
-        TypeError: It is neither.
-        ValueError: The sequence has another length.
-    """
-    if isinstance(given, Mapping):
-        shared = dict(given)
-        return [shared] * count
-    if not isinstance(given, Sequence) or isinstance(given, (str, bytes)):
-        raise TypeError(f"options must be a mapping, or a sequence of mappings, got {given!r}")
-    if len(given) != count:
-        raise ValueError(f"options must have one mapping for each of {count} environments, got {len(given)}")
-    return [None if each is None else mapping("options", each) for each in given]
