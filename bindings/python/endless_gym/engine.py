@@ -119,7 +119,7 @@ _NAME = "the engine names itself; `endless serve --service NAME` takes a name, f
 
 
 @named(instead={**INSTEAD, "name": _NAME, "service": _NAME})
-def serve(
+def serve(  # noqa: D417
     id: str,
     num_envs: int = 1,
     num_threads: int | None = None,
@@ -162,12 +162,6 @@ def serve(
         num_envs: Environments in each group.
         num_threads: Threads of the engine; `None` or 0 for one per core.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
-        seed: As for `make_vec`.
-        seeds: As for `make_vec`.
-        options: As for `make_vec`.
-        autoreset: As for `make_vec`.
-        observation: As for `make_vec`.
-        frames: As for `make_vec`.
         batches_held: Batches of a group whose arrays may be referenced at the same time, 1 to 16, less what `pin_memory` and
             `episode_info` take where the engine would lend more than 16.
         checkpoint: File to which the engine saves all environments when it is closed or ended by a signal, and when
@@ -178,14 +172,10 @@ def serve(
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
         pin_memory: As for `connect`; the engine lends one extra batch for it, up to 16 in all.
-        independent_episodes: As for `make_vec`.
-        state: As for `make_vec`.
-        first_env: As for `make_vec`.
-        total_envs: As for `make_vec`.
-        render_mode: As for `make_vec`.
-        view: As for `make_vec`.
         episode_options: As for `connect`.
         episode_info: As for `connect`; the engine lends one extra batch for it, up to 16 in all.
+
+    The other arguments are those of `make_vec`.
 
     Raises:
         TypeError: A number is not an integer.
