@@ -20,20 +20,9 @@ ROOMS = [
     ["_native", "arguments", "specs", "display", "program", "requests", "vector", "recording", "cli"],
     ["common", "settings", "environments", "memories", "agent", "training", "evaluation", "paper"],
 ]
-CRATES = [
-    "engine/kernels",
-    "engine/trainer",
-    "bindings/web",
-    "engine/cli",
-    "engine/core",
-    "engine/memory-gym",
-    "engine/page",
-    "engine/popgym",
-    "engine/service",
-    "engine/view",
-    "tests/faults",
-    "xtask",
-]
+#: The crates, except that of Python, whose files read the registry of its root.
+CRATES = [path.parent for path in sorted([*Path().glob("*/*/Cargo.toml"), Path("xtask/Cargo.toml")])]
+CRATES.remove(Path("bindings/python"))
 
 Module = tuple[str, ...]
 
