@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from typing import Any
 
-from endless_gym.program import program
+from endless_gym.program import OWN_GROUP, program
 from endless_gym.vector import EndlessVectorEnv
-
-#: A separate process group, so that Ctrl-C reaches only the training, which then stops the server.
-_OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
 class ViewProcess:
@@ -36,7 +32,7 @@ class ViewProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            **_OWN_GROUP,
+            **OWN_GROUP,
         )
         assert self._process.stdout is not None
         line = self._process.stdout.readline()

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import time
 import weakref
 from collections.abc import Mapping, Sequence
@@ -19,17 +18,13 @@ from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.create import connect
 from endless_gym.display.rendering import VECTOR_MODES, View, checked_view, modes_of
 from endless_gym.episodes import EpisodeOptions, validate_episode_options
-from endless_gym.program import program
+from endless_gym.program import OWN_GROUP, program
 from endless_gym.program.engine_log import EngineLog, level
 from endless_gym.requests.configuration import INSTEAD, AutoresetMode, AutoresetName, Options, checked_arguments
 from endless_gym.specs import Frames, ObservationName, json_text, spec
 from endless_gym.vector import EndlessVectorEnv
 
 _numbers = count()
-
-#: The engine has its own process group, so that only this process receives Ctrl-C, and then stops the engine. Python 3.10 can
-#: only start a session, which makes a step a third slower, since Linux schedules sessions as units (autogroup).
-_OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
 class EngineProcess:
@@ -43,7 +38,7 @@ class EngineProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
-            **_OWN_GROUP,
+            **OWN_GROUP,
         )
         if self._process.stdin is not None:
             # If the process has ended, `connect` reports it with its message.
