@@ -117,14 +117,10 @@ def shared() -> Iterator[Path]:
 def namespaces() -> list[str]:
     """A prefix for commands that gives them their own mount and IPC namespaces; empty if that is not permitted."""
     for unshare in (["unshare", "--mount", "--ipc"], ["unshare", "--mount", "--ipc", "--map-root-user"]):
-        try:
-            if (
-                subprocess.run([*unshare, "mount", "--bind", "/dev/shm", "/dev/shm"], capture_output=True).returncode
-                == 0
-            ):
+        with contextlib.suppress(FileNotFoundError):
+            mount = [*unshare, "mount", "--bind", "/dev/shm", "/dev/shm"]
+            if subprocess.run(mount, capture_output=True).returncode == 0:
                 return unshare
-        except FileNotFoundError:
-            break
     return []
 
 

@@ -76,26 +76,6 @@ def test_gymnasiums_checker_passes(id: str) -> None:
         check_env(gymnasium.make(f"EndlessGym/{id}", render_mode=mode).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("id", ["MortarMayhem-v0", "MysteryPath-v0", "SearingSpotlights-v0"])
-def test_a_window_shows_the_ground_truth_view(id: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    import pygame
-
-    shown, silent = (gymnasium.make(f"EndlessGym/{id}", render_mode=mode) for mode in ("human", "debug_rgb_array"))
-    for env in (shown, silent):
-        env.reset(seed=3)
-        env.render()
-    for _ in range(3):
-        shown.step(np.array([1, 2]))
-        silent.step(np.array([1, 2]))
-        assert shown.render() is None  # `step` has shown the picture
-        picture = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-        np.testing.assert_array_equal(picture, silent.render())
-        assert pygame.display.get_caption()[0] == f"{id}, seed 3"
-    shown.close()
-    assert not pygame.display.get_init()
-
-
 def test_observations_do_not_change() -> None:
     env = endless_gym.Env("MortarMayhem-v0")
     first, _ = env.reset(seed=1)

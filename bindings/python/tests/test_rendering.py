@@ -217,16 +217,23 @@ def test_close_button_stops_the_environment_until_close(invisible: None) -> None
     env.close()
 
 
-def test_a_window_shows_the_agents_view(invisible: None) -> None:
-    env = endless_gym.Env("MysteryPath-v0", "human", view="agent")
-    other = endless_gym.Env("MysteryPath-v0", "rgb_array")
-    env.reset(seed=1)
-    other.reset(seed=1)
-    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-    assert shown.shape == (336, 336, 3)
-    np.testing.assert_array_equal(shown[::4, ::4], other.render())
-    np.testing.assert_array_equal(shown[3::4, 3::4], other.render())
-    env.close()
+@pytest.mark.parametrize(("view", "mode"), [("agent", "rgb_array"), (None, "debug_rgb_array")])
+@pytest.mark.parametrize("id", ["MortarMayhem-v0", "MysteryPath-v0", "SearingSpotlights-v0"])
+def test_a_window_shows_each_step(id: str, view: Any, mode: str, invisible: None) -> None:
+    shown, silent = endless_gym.Env(id, "human", view=view), endless_gym.Env(id, mode)
+    for env in (shown, silent):
+        env.reset(seed=3)
+    for _ in range(3):
+        picture = silent.render()
+        scale = 336 // len(picture)
+        window = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        np.testing.assert_array_equal(window, picture.repeat(scale, 0).repeat(scale, 1))
+        assert pygame.display.get_caption()[0] == f"{id}, seed 3"
+        for env in (shown, silent):
+            env.step([1, 2])
+        assert shown.render() is None  # `step` has shown the picture
+    shown.close()
+    assert not pygame.display.get_init()
 
 
 @pytest.mark.parametrize("view", ["agent", "ground_truth"])
