@@ -33,10 +33,6 @@ IDS = ["Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpot
 VECTORS = ["SyncVectorEnv", "AsyncVectorEnv", "SubprocVecEnv"]
 SIZES = [64, 1024]
 
-#: Targets: multiple of the best vectorised original, multiple of the original's single environment, and share of the
-#: speed of the service from Rust.
-VECTORISED, SINGLE, OF_RUST = 300.0, 20.0, 0.9
-
 
 class Original:
     """The process that runs the original."""
@@ -142,26 +138,7 @@ def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, 
         "steps_per_second": {name: [round(value) for value in values] for name, values in results.items()},
         "best_original": max(vectors, key=lambda name: vectors[name]),
         "medians": {name: round(median) for name, median in medians.items()},
-        "targets": targets(medians, max(vectors.values())),
     }
-
-
-def targets(medians: dict[str, float], original: float) -> list[dict[str, Any]]:
-    """The targets, the measured values, and whether they are met."""
-    rows = []
-    for size in SIZES:
-        for way in ("make_vec", "serve"):
-            reached = medians[f"{way}, {size} environments"] / original
-            rows.append((f"{way} with {size} environments, times the best vectorised original", VECTORISED, reached))
-    reached = medians["gymnasium.make"] / medians["original, gymnasium.make"]
-    rows.append(("gymnasium.make, times the original's", SINGLE, reached))
-    size = SIZES[-1]
-    reached = medians[f"serve, {size} environments"] / medians[f"Rust, service, only receives, {size} environments"]
-    rows.append((f"serve with {size} environments, of the same from Rust", OF_RUST, reached))
-    return [
-        {"what": what, "target": target, "reached": round(reached, 2), "met": reached >= target}
-        for what, target, reached in rows
-    ]
 
 
 def markdown(whole: dict[str, Any]) -> str:
@@ -176,11 +153,6 @@ def markdown(whole: dict[str, Any]) -> str:
         for name, values in row["steps_per_second"].items():
             median = row["medians"][name]
             lines.append(f"| {name} | {median:,} | {min(values):,} | {max(values):,} | {median / reference:.1f} |")
-    names = [row["id"] for row in whole["environments"]]
-    lines += ["", "## Targets", "", f"| | target | {' | '.join(names)} |", f"| --- |{' ---: |' * (len(names) + 1)}"]
-    for same in zip(*(row["targets"] for row in whole["environments"]), strict=True):
-        reached = " | ".join(str(target["reached"]) for target in same)
-        lines.append(f"| {same[0]['what']} | {same[0]['target']} | {reached} |")
     return "\n".join(lines) + "\n"
 
 

@@ -136,8 +136,8 @@ def comparison(folder: Path, report: Path) -> None:
     found = list(measured(report.read_text()))
 
     def speeds(contender: str) -> list[float]:
-        """One number for each environment. A name may continue with their number; rows of targets are skipped."""
-        return [speed for name, speed in found if name.startswith(contender) and ", times" not in name]
+        """One number for each environment. A name may continue with their number."""
+        return [speed for name, speed in found if name.startswith(contender)]
 
     groups = {
         group: {what: speeds(contender) for contender, what in rows.items() if speeds(contender)}
