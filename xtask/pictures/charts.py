@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -212,21 +212,29 @@ def learning(folder: Path, results: Path) -> None:
     chart(folder, "learning", 3.1, draw)
 
 
+def panels(figure: Figure, theme: Theme, titles: list[str], agents: dict[str, tuple[str, float]]) -> list[Axes]:
+    """Axes with these titles in two columns, and the names of agents, each at a distance from the right edge, above them."""
+    axes = list(figure.subplots(-(-len(titles) // 2), 2, squeeze=False).flat)
+    for unused in axes[len(titles) :]:
+        unused.set_axis_off()
+    for each, title in zip(axes, titles, strict=False):
+        plain(each)
+        each.set_title(title, loc="left", fontsize=BODY)
+        each.tick_params(colors=theme.faint)
+        each.grid(axis="y", lw=1)
+    for agent, (name, distance) in agents.items():
+        style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
+        figure.text(0.985 - distance, 1 - 0.2 / figure.get_figheight(), name, **style)
+    return axes[: len(titles)]
+
+
 def tasks(folder: Path) -> None:
     """Learning curves of all tasks of `agents/benches/learning.py`, from the files in its folder and into it."""
     found = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
-    columns = 2
-    rows = -(-len(found) // columns)
 
     def draw(figure: Figure, theme: Theme) -> None:
-        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes in panels[len(found) :]:
-            axes.set_axis_off()
-        for axes, data in zip(panels, found, strict=False):
-            plain(axes)
-            axes.set_title(data["task"], loc="left", fontsize=BODY)
-            axes.tick_params(colors=theme.faint)
-            axes.grid(axis="y", lw=1)
+        agents = {agent: (AGENTS[agent], distance) for agent, distance in zip(AGENTS, (0, 0.06, 0.19), strict=True)}
+        for axes, data in zip(panels(figure, theme, [data["task"] for data in found], agents), found, strict=True):
             if data["best_reward"]:
                 axes.axhline(data["best_reward"], color=theme.faint, lw=0.8, ls="--")
             for run in data["runs"]:
@@ -235,49 +243,33 @@ def tasks(folder: Path) -> None:
                 window = max(1, len(steps) // POINTS)
                 axes.plot(steps[shown] / 1e6, smooth(rewards, window)[shown], color=theme.agents[run["agent"]], lw=1.2)
             axes.set_ylim(bottom=0)
-        for place, (agent, name) in enumerate(AGENTS.items()):
-            style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
-            figure.text(0.985 - (0, 0.06, 0.19)[place], 1 - 0.2 / figure.get_figheight(), name, **style)
         figure.subplots_adjust(0.06, 0.04, 0.985, 0.91, wspace=0.13, hspace=0.42)
-        header(
-            figure,
-            theme,
-            "Learning",
-            "Mean reward of 100 episodes by million environment steps; dashed: the best possible.",
-        )
+        note = "Mean reward of 100 episodes by million environment steps; dashed: the best possible."
+        header(figure, theme, "Learning", note)
 
-    chart(folder, "curves", 1.9 * rows + 0.6, draw)
+    chart(folder, "curves", 1.9 * -(-len(found) // 2) + 0.6, draw)
 
 
 def hour(folder: Path) -> None:
     """Curves of the runs of `agents/benches/hour.py`, from the files in its folder and into it."""
-    runs = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
-    environments = list(dict.fromkeys(run["env"] for run in runs))
-    columns = 2
-    rows = -(-len(environments) // columns)
+    environments: dict[str, list[dict[str, Any]]] = {}
+    for file in sorted(folder.glob("*.json")):
+        run = json.loads(file.read_text())
+        environments.setdefault(run["env"], []).append(run)
 
     def draw(figure: Figure, theme: Theme) -> None:
-        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes in panels[len(environments) :]:
-            axes.set_axis_off()
-        for axes, env in zip(panels, environments, strict=False):
-            own = [run for run in runs if run["env"] == env]
-            plain(axes)
-            axes.set_title(f"{env}, {own[0]['metric'].replace('_', ' ')}", loc="left", fontsize=BODY)
-            axes.tick_params(colors=theme.faint)
-            axes.grid(axis="y", lw=1)
+        titles = [f"{env}, {own[0]['metric'].replace('_', ' ')}" for env, own in environments.items()]
+        agents = {agent: (agent, place * 0.07) for place, agent in enumerate(("gru", "mingru", "trxl"))}
+        for axes, own in zip(panels(figure, theme, titles, agents), environments.values(), strict=True):
             for agent, score in own[0]["paper"].items():
                 axes.axhline(score, color=theme.agents[agent], lw=0.8, ls="--")
             for run in own:
                 minutes, _, values = np.array(run["curve"]).T
                 axes.plot(minutes, values, color=theme.agents[run["agent"]], lw=1.6)
             axes.set(xlim=(0, None), ylim=(0, None))
-        for place, agent in enumerate(("gru", "mingru", "trxl")):
-            style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
-            figure.text(0.985 - place * 0.07, 1 - 0.2 / figure.get_figheight(), agent, **style)
         height = figure.get_figheight()
         figure.subplots_adjust(0.06, 0.3 / height, 0.985, 1 - 0.95 / height, wspace=0.13, hspace=0.5)
         note = "Evaluation over minutes of training on one core; dashed: the end of the paper's training, from frames."
         header(figure, theme, "An hour on one core", note)
 
-    chart(folder, "hour", 1.9 * rows + 0.9, draw)
+    chart(folder, "hour", 1.9 * -(-len(environments) // 2) + 0.9, draw)
