@@ -508,13 +508,7 @@ def _presets() -> dict[str, Settings]:
         transformer={"layers": 2, "width": 64, "window": 64, "sequence_length": 32},
         model={"vector_width": 64, "head_width": 64, "value_gain": 0.05},
     )
-    return {
-        "paper": paper,
-        "old": old,
-        "overnight": overnight,
-        "gpu": gpu,
-        "quick": quick,
-    }
+    return {"paper": paper, "old": old, "overnight": overnight, "gpu": gpu, "quick": quick}
 
 
 #: Default settings by preset name.

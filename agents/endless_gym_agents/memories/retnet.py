@@ -39,12 +39,7 @@ class RetNet(SequenceModel):
     theta: Tensor
 
     def __init__(
-        self,
-        input_width: int,
-        width: int,
-        heads: int = 4,
-        value_factor: float = 2.0,
-        feed_forward: float = 4 / 3,
+        self, input_width: int, width: int, heads: int = 4, value_factor: float = 2.0, feed_forward: float = 4 / 3
     ) -> None:
         """Make the layer.
 

@@ -125,13 +125,7 @@ Numbers = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
 def gru_forward(
-    inputs: Numbers,
-    weight: Numbers,
-    bias: Numbers,
-    state: Numbers,
-    resets: Flags,
-    saved: Numbers,
-    outputs: Numbers,
+    inputs: Numbers, weight: Numbers, bias: Numbers, state: Numbers, resets: Flags, saved: Numbers, outputs: Numbers
 ) -> None: ...
 def gru_backward(
     weight: Numbers,
@@ -165,10 +159,5 @@ def lstm_backward(
 ) -> None: ...
 def mingru_forward(inputs: Numbers, state: Numbers, resets: Flags, saved: Numbers, outputs: Numbers) -> None: ...
 def mingru_backward(
-    inputs: Numbers,
-    saved: Numbers,
-    grad_outputs: Numbers,
-    resets: Flags,
-    grad_inputs: Numbers,
-    grad_state: Numbers,
+    inputs: Numbers, saved: Numbers, grad_outputs: Numbers, resets: Flags, grad_inputs: Numbers, grad_state: Numbers
 ) -> None: ...

@@ -12,14 +12,7 @@ from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.display.rendering import TEXT_MODES, VECTOR_MODES, View, checked_view
 from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
 from endless_gym.interop import PageLocks, cuda_to_pin, page_locked_bytes
-from endless_gym.requests.configuration import (
-    INSTEAD,
-    MODES,
-    AutoresetMode,
-    AutoresetName,
-    Options,
-    checked_arguments,
-)
+from endless_gym.requests.configuration import INSTEAD, MODES, AutoresetMode, AutoresetName, Options, checked_arguments
 from endless_gym.requests.results import Results
 from endless_gym.specs import Frames, ObservationName, described_spec, json_text
 from endless_gym.vector import EndlessVectorEnv

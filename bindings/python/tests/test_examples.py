@@ -77,10 +77,7 @@ RUNS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("example", "env_id", "printed"),
-    [pytest.param(*run, id=" ".join(run[:2])) for run in RUNS],
-)
+@pytest.mark.parametrize(("example", "env_id", "printed"), [pytest.param(*run, id=" ".join(run[:2])) for run in RUNS])
 def test_example_runs(tmp_path, request, example, env_id, printed):
     script, *arguments = example.split()
     python = request.getfixturevalue("libraries_python") if script == "jax_service.py" else sys.executable
@@ -136,10 +133,7 @@ def test_a_minibatch_of_one_step_is_finite(tmp_path, example):
 
 @pytest.mark.parametrize(
     ("env_id", "observation", "runners", "memory"),
-    [
-        ("Endless-MortarMayhem-v0", "rgb", 1, "lstm"),
-        ("MysteryPath-Grid-v0", "features", 0, "none"),
-    ],
+    [("Endless-MortarMayhem-v0", "rgb", 1, "lstm"), ("MysteryPath-Grid-v0", "features", 0, "none")],
 )
 def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, runners, memory):
     arguments = {
