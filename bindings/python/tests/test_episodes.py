@@ -285,6 +285,8 @@ def test_info_has_seeds_and_options_of_running_episodes(where: Callable[..., Env
         info = envs.recv(0)[4]
         assert info["seed"].tolist() == [70, 71]
         assert info["options"].tolist() == [{}, {}]
+        info = envs.reset(group=0, seed=[8, 9], options={"reset_mask": np.array([False, True])})[1]
+        assert info["seed"].tolist() == [70, 9]
     with where(ID, 2, seed=8, episode_info=True, autoreset="same_step") as envs:
         info = envs.reset()[1]
         assert (info["seed"].tolist(), info["_seed"].tolist()) == ([8, 9], [True, True])
