@@ -1,5 +1,6 @@
 """Small agents and their rollouts, for the tests of the agents."""
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,6 +25,15 @@ _FLAGS = {"preset": "quick", "agent": "gru", "environment.option": ["command_cou
 _FLAGS |= {"ppo.updates": 6, "ppo.steps": 256, "recurrence.hidden-size": 16}
 EXPERIMENT["runs"] = [{"name": "gru", "env": "MortarMayhem-Grid-v0", "flags": _FLAGS}]
 
+GRID = "MortarMayhem-Grid-v0"
+
+#: Frames, and the heads that need them and a ground truth.
+ALL_HEADS = {
+    "env": "Endless-MortarMayhem-v0",
+    "environment": {"option": (), "observation": "rgb"},
+    "ppo": {"reconstruction_coefficient": 0.1, "ground_truth_coefficient": 0.1},
+}
+
 FEATURES = {"features": (6,)}
 BRANCHES = (3, 2)
 
@@ -42,6 +52,37 @@ def settings(agent: str, **changes: Any) -> Settings:
         "model": Model(vector_width=12, head_width=10),
     }
     return changed(replace(PRESETS["quick"], agent=agent, **small), **changes)
+
+
+def small(agent: str, run: Path, updates: int = 3, **environment: Any) -> Settings:
+    given = settings(agent, env=GRID, run=str(run), checkpoint_interval=2, threads=1)
+    changes = {"num_envs": 8, "groups": 2, "option": ("command_count=[1, 2]",), **environment}
+    return changed(given, environment=changes, ppo={"steps": 16, "minibatches": 2, "updates": updates})
+
+
+def progress(run: Path) -> list[dict[str, Any]]:
+    """The metrics of all updates without timings."""
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if not k.startswith("seconds/") and k != "steps_per_second"} for row in rows]
+
+
+def same(one: Any, two: Any) -> bool:
+    """Whether the contents of two checkpoints are bitwise equal."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, two)
+    if isinstance(one, dict):
+        return one.keys() == two.keys() and all(same(one[key], two[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(two) and all(map(same, one, two))
+    return bool(one == two)
+
+
+def assert_equal_runs(one: Path, two: Path, message: str = "") -> None:
+    """The metrics of two runs, and the states from which they resume, are bitwise equal."""
+    assert progress(one) == progress(two), message
+    states = [checkpoint.load(run).state for run in (one, two)]
+    for part in ("update", "steps", "model", "optimizer", "generators", "player", "episodes"):
+        assert same(*(state[part] for state in states)), f"{part} {message}"
 
 
 def transformer(**changes: Any) -> dict[str, Any]:

@@ -1,9 +1,15 @@
 """Fixtures of the agents' tests."""
 
+import importlib
 import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+from typing import IO, Any
 
 import pytest
 
@@ -19,6 +25,32 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         monkeypatch.delenv("RAY_ADDRESS", raising=False)  # otherwise Ray joins that cluster
         yield folder
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the commands of jobs in this process, one after the other, without the start of another one."""
+    from endless_gym_agents.paper import jobs
+
+    def start(machine: jobs.Machine, command: Sequence[str], slot: int, lock: IO[str], log: IO[str]) -> Any:
+        main = importlib.import_module(jobs._MODULES[command[0]]).main
+        with redirect_stdout(log), redirect_stderr(log), monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", list(command))
+            status = main()
+        return SimpleNamespace(poll=lambda: status)
+
+    monkeypatch.setattr(jobs.Machine, "start", start)
+    monkeypatch.setattr(jobs, "_POLL", 0.0)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(own_namespace: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of `small("gru", ...)` with four updates."""
+    from agents_helpers import small
+
+    from endless_gym_agents.training.train import train
+
+    return train(small("gru", tmp_path_factory.mktemp("undisturbed") / "run", 4))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-# Each forked process would import it for seconds.
-import torch._dynamo  # noqa: F401
-from test_agents_training import progress, same, small
+# Each forked process would import them for seconds.
+import torch._dynamo
+import torch.utils.tensorboard  # noqa: F401
+from agents_helpers import assert_equal_runs, small
 
-from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.train import train
 
 
@@ -59,10 +59,7 @@ def main() -> None:
             status = ended(lambda number=number: killed(number))
             again = resume if (run / "settings.json").exists() else given
             assert ended(lambda again=again: train(again)) == 0, f"after call {number}"
-            assert progress(run) == progress(whole), f"after call {number}"
-            one, two = (checkpoint.load(each).state for each in (run, whole))
-            for part in ("update", "model", "optimizer", "generators", "player", "episodes"):
-                assert same(one[part], two[part]), f"{part} after call {number}"
+            assert_equal_runs(run, whole, f"after call {number}")
             files = [sorted((each / "checkpoints").iterdir()) for each in (run, whole)]
             # Without the checksums of parts, which differ as the settings have the folder of the run.
             names = [[re.sub("-[0-9a-f]{8}$", "", file.name) for file in each] for each in files]

@@ -1,7 +1,8 @@
-"""Checks of copies to a stand-in for a CUDA device, each in a process of its own, since a registered device cannot be removed."""
+"""Checks on a stand-in for a CUDA device, each in a process of its own: `python on_other_device.py FOLDER`."""
 
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,14 +10,20 @@ from typing import Any
 
 import numpy as np
 import other_device
+import pytest
+import test_agents_operations
 import torch
-from agents_helpers import changed, collecting, settings
+from agents_helpers import ALL_HEADS, changed, collecting, progress, settings, small
+from kills import ended
 from other_device import NAME, in_flight, locked
-from test_agents_training import ALL_HEADS, progress, small
 
 from endless_gym import EndlessVectorEnv, make_vec, serve
+from endless_gym_agents.common import own
 from endless_gym_agents.common.clock import Clock
 from endless_gym_agents.environments.recovery import RecoverableEngine
+from endless_gym_agents.memories import MEMORIES
+from endless_gym_agents.memories.sequence_model import Stack
+from endless_gym_agents.training.ppo import learn, make_optimizer
 from endless_gym_agents.training.train import train
 from endless_gym_agents.training.transfers import Upload
 
@@ -220,8 +227,84 @@ def training(folder: Path) -> None:
     assert trained("waiting", "thread") == inside == served == killed
 
 
-def run(check: str, folder: str) -> None:
-    """Run a check, by its name."""
+def waits(folder: Path) -> None:
+    """A rollout waits only for the actions and copies each observation once; an update waits only for its metrics."""
+    for agent in ("gru", "trxl", "stack"):
+        given = test_agents_operations.small(agent)
+        steps, groups = given.ppo.steps, given.environment.groups
+        with collecting(given, NAME) as collector:
+            optimizer = make_optimizer(collector.agent, 1e-3)
+            for _ in range(2):
+                other_device.waits.clear()
+                other_device.uploads.clear()
+                segment, _ = collector.collect(Clock())
+                # Each action is copied to the CPU.
+                assert other_device.waits == {"copy_": steps * groups}, agent
+                # Each group's observation, including the last, is uploaded once; rewards and ends of episodes together.
+                assert other_device.uploads == {(2, 4): steps * groups, (4, 17): (steps + 1) * groups}, agent
+                states = [memory.state for memory in collector.memories]
+                other_device.waits.clear()
+                learn(collector.agent, optimizer, segment, states, 1, given.ppo, torch.Generator().manual_seed(0))
+                assert other_device.waits.total() == 1, agent
+
+
+def rejects(folder: Path) -> None:
+    """The stand-in rejects what CUDA rejects."""
+    layer, here = torch.nn.Linear(2, 2).to(NAME), torch.ones(3, 2)
+    assert layer(here.to(NAME)).device.type == NAME and layer(here.to(NAME)).cpu().device.type == "cpu"
+    for wrong, message in (
+        (lambda: layer(here), "addmm: tensors on two devices"),
+        (lambda: here.to(NAME) + here, "add: tensors on two devices"),
+        (lambda: here.to(NAME).numpy(), "numpy"),
+    ):
+        with pytest.raises((RuntimeError, TypeError), match=message):
+            wrong()
+
+
+def memories(folder: Path) -> None:
+    """Outputs, states and gradients of sequences, where scans over steps are associative, and outputs of steps."""
+
+    def computed(name: str, place: str) -> list[torch.Tensor]:
+        torch.manual_seed(1)
+        model = Stack(own.load("--agent", MEMORIES[name], torch.nn.Module), 16, 16, 2, {})
+        for parameter in model.parameters():
+            parameter.data += 0.1 * torch.randn_like(parameter)
+        x, resets = torch.randn(90, 3, 16), torch.rand(90, 3) < 0.05
+        state = {key: torch.zeros(3, *shape) for key, shape in model.state_shapes.items()}
+        model, x, resets = model.to(place), x.to(place).requires_grad_(), resets.to(place)
+        state = {key: part.to(place) for key, part in state.items()}
+        y, after = model.sequence(x, state, resets)
+        gradients = torch.autograd.grad((y * y.detach().roll(1, -1)).mean(), [x, *model.parameters()])
+        return [part.detach().cpu() for part in (y, *after.values(), *gradients, *model.step(x[0], after)[1].values())]
+
+    for name in MEMORIES:
+        for here, there in zip(computed(name, "cpu"), computed(name, NAME), strict=True):
+            assert here.abs().max() > 0
+            torch.testing.assert_close(there, here, rtol=1e-4, atol=1e-4 * float(here.abs().max()), msg=name)
+
+
+CHECKS = (
+    copies,
+    early_release,
+    killed_engine,
+    closing,
+    kept_arrays,
+    rollouts,
+    training,
+    waits,
+    rejects,
+    memories,
+)
+
+
+def main() -> None:
+    """Run each check in a process of its own, and print the names of those that pass."""
     other_device.register()
-    with other_device.device():
-        globals()[check](Path(folder))
+    for check in CHECKS:
+        with other_device.device():
+            assert ended(lambda check=check: check(Path(sys.argv[1]))) == 0, check.__name__
+        print(f"passed: {check.__name__}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from agents_helpers import saved, settings
-from test_agents_training import same
+from agents_helpers import same, saved, settings
 
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import make_agent
@@ -165,7 +164,10 @@ def test_the_message_names_what_is_wrong(file: Path, tmp_path: Path) -> None:
         ({"version": 7}, "must be of version 1, got 7"),
         ({"model": None}, "is incomplete: it has no model"),
         ({"settings": None, "steps": None}, "is incomplete: it has no settings, steps"),
-        ({"model": weights | {name: torch.full_like(weights[name], torch.nan)}}, f"not finite, in {name}"),
+        *(
+            ({"model": weights | {name: torch.full_like(weights[name], value)}}, f"not finite, in {name}")
+            for value in (torch.nan, torch.inf)
+        ),
         ({"model": {key: part for key, part in weights.items() if key != name}}, f"there are no weights {name}"),
         ({"settings": to_dict(other)}, r"must have shape \(.*17.*\) according to the settings, got"),
         ({"settings": to_dict(dataclasses.replace(other, env="Other-v0"))}, "id must be one of"),

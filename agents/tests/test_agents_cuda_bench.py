@@ -6,14 +6,11 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
-
 from endless_gym_agents.settings import AGENTS
 
 PROGRAM = Path(__file__).parents[1] / "benches" / "on_cuda.py"
 
 
-@pytest.mark.slow
 def test_parts_that_need_no_gpu_run_on_the_cpu(tmp_path: Path) -> None:
     timed = ("gru", "trxl", "mingru", "lru")
     files = ("--json", str(tmp_path / "cuda.json"), "--markdown", str(tmp_path / "cuda.md"))

@@ -77,7 +77,6 @@ def test_rollouts_mark_the_steps_that_only_reset(autoreset: str, example: Any, t
     trainer.envs.close()
 
 
-@pytest.mark.slow
 def test_a_run_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     few = ["--run", str(tmp_path), "--num-envs", "4", "--num-steps", "8", "--num-minibatches", "2", "--option", OPTION]
 
@@ -92,7 +91,6 @@ def test_a_run_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     assert [(row["update"], row["steps"]) for row in rows] == [(1, 32), (2, 64), (3, 96), (4, 128)]
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_it_learns_as_fast_as_the_packaged_trainer_in_both_auto_reset_modes(tmp_path: Path) -> None:
     """The mean return over a fixed budget of steps, in which an agent goes from a fifth of the best return to all of it."""

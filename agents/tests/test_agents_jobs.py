@@ -16,9 +16,8 @@ from typing import IO
 
 import psutil
 import pytest
-from agents_helpers import EXPERIMENT
+from agents_helpers import EXPERIMENT, progress, same
 from rich.console import Console
-from test_agents_training import progress, same
 
 from endless_gym_agents.paper import jobs, jobs_ray, search
 from endless_gym_agents.paper.experiments import definitions, planning
@@ -139,7 +138,6 @@ def values(folder: Path) -> dict[int, tuple[str, float | None, dict[int, float]]
     }
 
 
-@pytest.mark.slow
 @WHERE
 def test_workers_of_a_search_resume_only_the_trial_of_a_killed_one(
     where: Sequence[str], tmp_path: Path, program: Program
@@ -172,7 +170,6 @@ def test_workers_of_a_search_resume_only_the_trial_of_a_killed_one(
     assert [file.name for file in (tmp_path / "shared" / "locks").iterdir()] == ["study"]
 
 
-@pytest.mark.slow
 @WHERE
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_stop_with_their_search(
@@ -225,7 +222,6 @@ def test_workers_stop_with_their_search(
     assert [row["update"] for row in read_progress(first)] == list(range(1, done + 2))
 
 
-@pytest.mark.slow
 @WHERE
 def test_stopped_runs_of_an_experiment_equal_uninterrupted_ones(
     where: Sequence[str], tmp_path: Path, program: Program
@@ -280,7 +276,6 @@ def test_stopped_runs_of_an_experiment_equal_uninterrupted_ones(
     assert job.state() == "not started"
 
 
-@pytest.mark.slow
 def test_the_end_of_ray_removes_shared_memory_of_killed_trainers(
     tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]]
 ) -> None:
@@ -292,7 +287,6 @@ def test_the_end_of_ray_removes_shared_memory_of_killed_trainers(
     assert not segments()
 
 
-@pytest.mark.slow
 def test_a_signal_while_a_job_starts_stops_it(tmp_path: Path) -> None:
     class Interrupting(jobs.Machine):
         def start(self, command: Sequence[str], slot: int, lock: IO[str], log: IO[str]) -> jobs.Process:

@@ -32,7 +32,6 @@ def test_task_is_learnt_at_nine_tenths_of_its_best_result(id: str, means: dict[s
     assert (learnt(spec(id), given) is not None) is is_learnt
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "stops"), [({}, True), ({"stop_when_learnt": False}, False), ({"target_reward": 9.0}, False)]
 )

@@ -45,16 +45,12 @@ KINDS = {
     "trxl, short sequences": ("trxl", transformer(sequence_length=4)),
     "trxl, one sequence": ("trxl", transformer(sequence_length=64)),
     "trxl, single steps": ("trxl", transformer(sequence_length=1)),
-    "trxl, single steps, short window": ("trxl", transformer(sequence_length=1, window=6)),
     "trxl, single steps, separate heads": ("trxl", transformer(sequence_length=1, shared_heads=False)),
     "trxl, single steps, relative": ("trxl", transformer(sequence_length=1, positional_encoding="relative")),
     "trxl, single steps, learned": ("trxl", transformer(sequence_length=1, positional_encoding="learned")),
     "gtrxl": ("gtrxl", transformer(gate_bias=2.0)),
 }
 TRANSFORMERS = [name for name in KINDS if "trxl" in name]
-#: Those whose longest test is not slow.
-FAST = ["trxl", "trxl, relative", "trxl, single steps", "gtrxl, learned, previous"]
-OTHERS = [name for name in TRANSFORMERS if name not in FAST]
 
 
 @pytest.fixture(autouse=True)
@@ -176,8 +172,8 @@ def test_gradients_are_the_same_for_each_sequence_length(name: str) -> None:
         torch.testing.assert_close(other, gradients[0], rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", FAST + [pytest.param(name, marks=pytest.mark.slow) for name in OTHERS])
-@pytest.mark.parametrize("recording", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", TRANSFORMERS)
+@pytest.mark.parametrize("recording", [True, False])
 def test_kv_cache_equals_a_loop_over_windows(name: str, recording: bool) -> None:
     """Transformer-XL against a plain loop that projects the window of each step and environment separately."""
     agent = agent_of(name)

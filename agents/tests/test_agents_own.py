@@ -37,7 +37,6 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "min_gru.py"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", range(3))
 def test_the_commands_of_the_page_work(
     number: int, file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -156,7 +155,7 @@ class Frames(Flat):
 '''
 
 
-@pytest.mark.parametrize(("engine", "groups"), [("thread", 2), pytest.param("process", 1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("engine", "groups"), [("thread", 2), ("process", 1)])
 def test_a_resumed_run_with_a_wrapper_equals_an_undisturbed_one(
     engine: str, groups: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,6 @@ def synthetic(linear: bool) -> dict[tuple[str, str, str], Score]:
     return {(score.column, score.source, score.probe): score for score in scores}
 
 
-@pytest.mark.slow
 def test_a_linear_memory_is_read_by_both_probes_and_noise_by_none() -> None:
     scores = synthetic(linear=True)
     assert scores["a", "memory", "linear"].explained > 0.99
@@ -45,7 +44,6 @@ def test_a_linear_memory_is_read_by_both_probes_and_noise_by_none() -> None:
     assert 0.4 < guess < 0.6
 
 
-@pytest.mark.slow
 def test_only_the_nonlinear_probe_reads_a_nonlinear_memory() -> None:
     scores = synthetic(linear=False)
     assert scores["a", "memory", "linear"].explained < 0.05

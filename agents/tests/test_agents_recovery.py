@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agents_helpers import changed
-from test_agents_training import GRID, progress, same, small
+from agents_helpers import GRID, assert_equal_runs, changed, progress, small
 
 import endless_gym_agents.training.train as train_module
 from endless_gym import EngineLost, make_vec, serve
@@ -22,7 +21,6 @@ from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.train import train
 
 UPDATES = 4
-PARTS = ("update", "steps", "model", "optimizer", "generators", "player", "episodes")
 
 
 def kill(engine: RecoverableEngine) -> None:
@@ -54,24 +52,15 @@ def kill_before(monkeypatch: pytest.MonkeyPatch, place: str, calls: set[int]) ->
     monkeypatch.setattr(owner, name, call)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(small("gru", tmp_path_factory.mktemp("undisturbed") / "run", UPDATES))
-
-
-def compare(run: Path, other: Path) -> None:
-    assert progress(run) == progress(other)
-    one, two = (checkpoint.load(each).state for each in (run, other))
-    for part in PARTS:
-        assert same(one[part], two[part]), part
-
-
 #: Each update has 32 calls of `send` and `receive`, 16 for each of two groups.
 PLACES = [
-    *(pytest.param(*place, marks=pytest.mark.slow) for place in (("send", 1), ("receive", 1), ("send", 32 * UPDATES))),
+    ("send", 1),
+    ("receive", 1),
+    ("send", 32 * UPDATES),
     ("receive", 32 * UPDATES),
     ("mark", UPDATES),
-    *(pytest.param(*place, marks=pytest.mark.slow) for place in (("learn", UPDATES), ("snapshots", 2))),
+    ("learn", UPDATES),
+    ("snapshots", 2),
 ]
 
 
@@ -87,16 +76,15 @@ def test_a_run_whose_engine_is_killed_equals_an_undisturbed_run(
     at = random.Random(f"{place} {number}").randrange(number)
     kill_before(monkeypatch, place, {at})
     run = train(small("gru", tmp_path / "run", UPDATES, engine="process"))
-    compare(run, undisturbed)
+    assert_equal_runs(run, undisturbed)
     output = capsys.readouterr().out
     assert output.count(f"the engine process has ended; restart 1 of {MAX_RESTARTS}") == 1, at
     assert re.search(r"a new engine process continues the update, after \d+ steps that were played again", output)
 
 
-@pytest.mark.slow
 def test_restarts_are_counted_per_update(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kill_before(monkeypatch, "receive", {3, 17, 40, 41, 60, 90, 127})
-    compare(train(small("gru", tmp_path / "run", UPDATES, engine="process")), undisturbed)
+    assert_equal_runs(train(small("gru", tmp_path / "run", UPDATES, engine="process")), undisturbed)
 
 
 WRAPPER = """
@@ -125,7 +113,7 @@ def test_a_wrapper_does_not_notice_that_the_engine_was_replaced(
     one, two = (changed(small("gru", tmp_path / name, 2, engine="process"), environment=wrapper) for name in "ab")
     undisturbed = train(one)
     kill_before(monkeypatch, "receive", {37})
-    compare(train(two), undisturbed)
+    assert_equal_runs(train(two), undisturbed)
     assert "a new engine process continues the update, after " in capsys.readouterr().out
 
 
@@ -151,7 +139,7 @@ def test_run_saves_a_checkpoint_when_the_engine_is_given_up(
     assert checkpoint.load(given.run).update == 2
     assert len(progress(Path(given.run))) == 2
     train(replace(given, resume=given.run))
-    compare(Path(given.run), undisturbed)
+    assert_equal_runs(Path(given.run), undisturbed)
 
 
 def test_policy_fail_raises_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,10 +157,9 @@ def test_a_resumed_run_recovers(undisturbed: Path, tmp_path: Path, monkeypatch: 
         # After the restoration of the checkpoint, before the first mark.
         kill_before(patch, "mark", {0})
         train(replace(small("gru", tmp_path, UPDATES, engine="process"), resume=str(run)))
-    compare(run, undisturbed)
+    assert_equal_runs(run, undisturbed)
 
 
-@pytest.mark.slow
 def test_an_engine_that_does_not_answer_is_replaced() -> None:
     """A stopped process is alive, and only SIGKILL ends it."""
     arguments = {"num_envs": 2, "groups": 2, "seed": 1, "autoreset": "same_step"}

@@ -205,7 +205,7 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed[NAMES.index("endless")]["runs"][0]["updates"] == 50_000
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize("name", list({definitions.load(name).kind: name for name in NAMES}.values()))
 def test_smallest_version_of_each_kind_of_experiment_runs(name: str, tmp_path: Path) -> None:
     """One run with one update, through evaluation and report."""

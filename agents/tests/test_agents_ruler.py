@@ -32,8 +32,6 @@ def test_experts_and_random_actions_have_the_scores_of_the_ruler(name: str) -> N
     assert round(ruler.mean_return(task, expert=False), 4) == task.random
     assert task.passes_gate(task.random)
     assert not task.passes_gate(task.expert)
-    assert task.normalised(task.expert, task.random) == 1.0
-    assert task.normalised(task.random, task.random) == 0.0
 
 
 def test_a_longer_version_fits_the_agents_of_its_task() -> None:
@@ -188,8 +186,6 @@ def written(folder: Path, **changes: Any) -> Path:
 def test_mistakes_in_a_track_are_named(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=re.escape(message).replace(r"\.\*", ".*")):
         leaderboard.read(str(written(tmp_path, **changes)))
-    with pytest.raises(ValueError, match="track must be one of full, laptop, path, or a JSON file; got `nope`"):
-        leaderboard.read("nope")
 
 
 def test_all_agents_are_tuned_with_the_same_common_choices(tmp_path: Path) -> None:
@@ -214,7 +210,7 @@ def test_all_agents_are_tuned_with_the_same_common_choices(tmp_path: Path) -> No
     assert len(leaderboard.trials(small, track.agents["none"])) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("in_process")
 def test_a_track_of_your_own_is_tuned_resumed_and_extended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -258,29 +254,14 @@ def test_a_track_of_your_own_is_tuned_resumed_and_extended(
         leaderboard.execute(leaderboard.LeaderboardArguments(str(file), out=tmp_path / "other"))
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("in_process")
 def test_an_agent_enters_a_track_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a smaller version, which has other budgets than the package's rows; the best agents are exported."""
-
-    def run(*arguments: str) -> int:
-        given = [
-            "laptop",
-            "--seeds",
-            "1",
-            "--scale",
-            "tiny",
-            "--jobs",
-            "2",
-            "--device",
-            "cpu",
-            "--out",
-            str(tmp_path / "out"),
-        ]
-        monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given, *arguments])
-        return leaderboard.main()
-
     best, folder = tmp_path / "best", tmp_path / "out/scale-2e-05/laptop"
-    assert run("--agents", "mingru", "none", "--tasks", "one-command", "repeat-first", "--best", str(best)) == 0
+    given = f"laptop --seeds 1 --scale tiny --device cpu --out {tmp_path / 'out'} --best {best}"
+    given += " --agents mingru none --tasks one-command repeat-first"
+    monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given.split()])
+    assert leaderboard.main() == 0
     rows = json.loads((folder / "results.json").read_text())["rows"]
     assert [(row["agent"], row["task"], row["steps"] > 0) for row in rows] == [
         (agent, task, True) for agent in ("mingru", "none") for task in ("one-command", "repeat-first")
@@ -303,7 +284,7 @@ def test_the_rows_of_the_package_have_equal_budgets() -> None:
         assert set(comparison.aggregates) == track.agents.keys(), name
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("in_process")
 def test_the_page_from_idea_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With one update, and without the environment that the page builds."""
     text = (Path(__file__).parents[2] / "docs/train/from-idea-to-table.md").read_text()

@@ -63,7 +63,6 @@ def test_single_changes_differ_in_one_parameter() -> None:
     assert (value(lstm, "agent"), lstm.ppo.epochs, lstm.ppo.gamma) == ("lstm", 4, base.ppo.gamma)
 
 
-@pytest.mark.slow
 def test_search_from_start_to_end(tmp_path: Path) -> None:
     """Single changes, then a combination; restarting a complete search runs no trial."""
     first = Trials(small(tmp_path, stage="single"), QUIET)

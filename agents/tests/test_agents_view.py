@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_agents_training import small
+from agents_helpers import small
 
 from endless_gym_agents.environments.groups import Environments
 

@@ -97,7 +97,6 @@ def start() -> Iterator[Start]:
             process.wait()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("agent", "ranks", "arguments"),
     [
@@ -124,7 +123,6 @@ def test_ranks_compute_what_one_process_computes(
                 assert math.isclose(expected[name], found[name], rel_tol=1e-4, abs_tol=1e-5), name
 
 
-@pytest.mark.slow
 def test_run_restarts_when_a_rank_is_killed(tmp_path: Path, segments: Callable[[], set[str]], start: Start) -> None:
     run, engines = tmp_path / "run", ("--agent", "gru", "--environment.engine", "process")
     undisturbed = start(tmp_path / "undisturbed", 2, *engines, "--ppo.updates", "12")
@@ -141,7 +139,6 @@ def test_run_restarts_when_a_rank_is_killed(tmp_path: Path, segments: Callable[[
     assert segments() == set()
 
 
-@pytest.mark.slow
 def test_all_ranks_end_within_seconds_of_one(tmp_path: Path, segments: Callable[[], set[str]], start: Start) -> None:
     run = tmp_path / "run"
     process = start(run, 2, "--agent", "none", "--environment.engine", "process", *ENDLESS)
@@ -156,7 +153,6 @@ def test_all_ranks_end_within_seconds_of_one(tmp_path: Path, segments: Callable[
     assert segments() == set()
 
 
-@pytest.mark.slow
 def test_interrupted_run_resumes_with_the_same_or_another_number_of_ranks(tmp_path: Path, start: Start) -> None:
     run = tmp_path / "run"
     process = start(run, 2, "--agent", "trxl", *ENDLESS)
@@ -184,7 +180,6 @@ def test_interrupted_run_resumes_with_the_same_or_another_number_of_ranks(tmp_pa
     assert [row["update"] for row in rows(run)] == list(range(1, done + 4))
 
 
-@pytest.mark.slow
 def test_no_thread_outlives_the_connection(tmp_path: Path) -> None:
     """A gloo thread that still runs when the interpreter exits can crash the process with a signal."""
     program = tmp_path / "program.py"
