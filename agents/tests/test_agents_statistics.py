@@ -29,9 +29,11 @@ def test_interquartile_mean_is_the_mean_of_the_middle_half(scores: list[float], 
     assert interquartile_mean(scores) == expected
 
 
-def test_bootstrap_of_three_runs() -> None:
-    """Of the 27 samples of 0, 3 and 9 with replacement, 1, 4, 23 and 26 have a sum of at most 0, 3, 18 and 21."""
-    assert stratified_bootstrap([0, 3, 9], confidence=0.8) == (1.0, 7.0)
+@pytest.mark.parametrize("runs", [6, 8])
+def test_bootstrap_has_the_quantiles_of_95_percent(runs: int) -> None:
+    """Half of the runs are 1. Of six draws, none is 1 in 1.6 % of samples, and at most one in 10.9 %; of eight, 0.4 and 3.5."""
+    interval = stratified_bootstrap([0, 1] * (runs // 2), lambda samples: samples.mean(1))
+    assert interval == pytest.approx((1 / runs, 1 - 1 / runs))
 
 
 def test_bootstrap_is_stratified_by_task() -> None:
@@ -45,12 +47,6 @@ def test_bootstrap_is_stratified_by_task() -> None:
 def test_bootstrap_is_of_the_interquartile_mean() -> None:
     """In 5 % of the samples, three or more of four draws are the 1. The interquartile mean is then 1; the mean is mostly less."""
     assert stratified_bootstrap([0, 0, 0, 1]) == (0.0, 1.0)
-
-
-def test_bootstrap_is_reproducible() -> None:
-    scores = np.random.default_rng(1).normal(size=(5, 3))
-    assert stratified_bootstrap(scores, seed=1) == stratified_bootstrap(scores, seed=1)
-    assert stratified_bootstrap(scores, seed=1) != stratified_bootstrap(scores, seed=2)
 
 
 def test_bootstrap_interval_has_its_nominal_coverage() -> None:
@@ -114,7 +110,7 @@ def test_wilsons_interval() -> None:
 @pytest.mark.parametrize(("runs", "tasks"), [(3, 6), (5, 1)])
 def test_intervals_cover_with_few_runs(runs: int, tasks: int) -> None:
     for one in coverage(runs, tasks, 1000):
-        assert one.iqm > 0.92 and one.gap > 0.92 and one.improvement > 0.93, one
+        assert 0.92 < one.iqm < 0.975 and 0.92 < one.gap < 0.975 and 0.93 < one.improvement < 0.98, one
         assert one.percentile < (0.9 if runs == 3 else 0.96)
 
 

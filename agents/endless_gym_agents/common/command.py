@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib.util
+import json
 import os
 import select
 import signal
@@ -139,6 +140,11 @@ def flags(values: Mapping[str, Any]) -> list[str]:
         else:
             arguments += [f"--{name}", *(map(str, value) if isinstance(value, list) else [str(value)])]
     return arguments
+
+
+def assignments(values: Mapping[str, Any]) -> tuple[str, ...]:
+    """Values by name, each as NAME=VALUE with a JSON value, as `--environment.option` takes them."""
+    return tuple(f"{name}={json.dumps(value)}" for name, value in values.items())
 
 
 def check_installed(user: str, package: str, extra: str = "train") -> None:

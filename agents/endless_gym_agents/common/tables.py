@@ -1,6 +1,10 @@
-"""Tables that the commands print."""
+"""Tables that the commands print or write."""
 
 from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
 
 from rich import box
 from rich.console import Console, Group, RenderableType
@@ -29,6 +33,19 @@ def table(title: str, columns: dict[str, bool], caption: str = "") -> Table:
     for name, right in columns.items():
         made.add_column(name, justify="right" if right else "left", no_wrap=True)
     return made
+
+
+def markdown(columns: Mapping[str, bool], rows: Iterable[Sequence[str]]) -> list[str]:
+    """The lines of a table in Markdown; `columns` as for `table`."""
+    ends = ("---:" if right else "---" for right in columns.values())
+    return [f"| {' | '.join(row)} |" for row in (columns, ends, *rows)]
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+    return text.getvalue()
 
 
 def show(made: Table, console: Console) -> None:

@@ -14,8 +14,6 @@ endless-compare --coverage                                # how often the interv
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import json
 import re
@@ -284,9 +282,9 @@ def _budget(task: str, rows: Sequence[Score]) -> int:
 def _aggregate(table: NDArray[np.float64]) -> Aggregate:
     seeds = len(table)
 
-    def estimated(estimate: estimates.Estimate) -> Estimate:
-        value = float(estimate(table.reshape(1, -1))[0])
-        return Estimate(value, *(estimates.interval(table, estimate) if seeds > 1 else ()))
+    def estimated(estimator: estimates.Estimator) -> Estimate:
+        value = float(estimator(table.reshape(1, -1))[0])
+        return Estimate(value, *(estimates.interval(table, estimator) if seeds > 1 else ()))
 
     shares = [float((table > threshold).mean()) for threshold in THRESHOLDS]
     profile = [Estimate(share, *(estimates.wilson(share, table.size) if seeds > 1 else ())) for share in shares]
@@ -304,7 +302,7 @@ def task_name(env: str, options: Mapping[str, Any]) -> str:
     for task in ruler.TASKS.values():
         if (task.env, Settings(environment=Environment(option=task.options)).options()) == (env, dict(options)):
             return task.name
-    return " ".join([env, *(f"{name}={json.dumps(value)}" for name, value in options.items())])
+    return " ".join([env, *command.assignments(options)])
 
 
 def read_scores(paths: Sequence[Path], metric: str = "reward") -> tuple[list[Score], dict[str, float]]:
@@ -324,13 +322,10 @@ def read_scores(paths: Sequence[Path], metric: str = "reward") -> tuple[list[Sco
     rows: dict[tuple[str, str, int, float, int], Score] = {}
     experts: dict[str, float] = {}
     protocols: dict[str, Path] = {}
-    for file in itertools.chain.from_iterable(map(_files, paths)):
-        data = _content(file)
-        if data is None:
-            raise ValueError(f"{file} is not a file of results, as `endless-eval --json` writes it")
+    for file, data in itertools.chain.from_iterable(map(_contents, paths)):
         if "experiments" in data:
             protocols.setdefault(json.dumps(data.get("protocol"), sort_keys=True), file)
-            found = list(_of_evaluation(file, metric, experts))
+            found = _of_evaluation(results.from_json(data, file), file, metric, experts)
         else:
             found = [of_row(row, file) for row in data["rows"]]
             if metric != "reward":
@@ -353,44 +348,47 @@ def _content(file: Path) -> dict[str, Any] | None:
     return data if isinstance(data, dict) and data.keys() & {"rows", "experiments"} else None
 
 
-def _files(path: Path) -> list[Path]:
-    """The files of results that a path names."""
+def _contents(path: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """The files of results that a path names, and their contents."""
     if not path.exists():
         raise FileNotFoundError(
             f"no such file or folder: {path}; expected results, as `endless-eval --json` writes them"
         )
     if not path.is_dir():
-        return [path]
+        if (data := _content(path)) is None:
+            raise ValueError(f"{path} is not a file of results, as `endless-eval --json` writes it")
+        return [(path, data)]
     for pattern in ("*.json", "**/*.json"):
-        if found := [file for file in sorted(path.glob(pattern)) if _content(file) is not None]:
+        if found := [(file, data) for file in sorted(path.glob(pattern)) if (data := _content(file)) is not None]:
             return found
     raise FileNotFoundError(
         f"no results in {path}; evaluate its runs with: endless-eval {path} --last --json results.json"
     )
 
 
-def _of_evaluation(file: Path, metric: str, experts: dict[str, float]) -> list[Score]:
+def _of_evaluation(
+    experiments: Sequence[results.Experiment], file: Path, metric: str, experts: dict[str, float]
+) -> list[Score]:
     found = []
-    for experiment in results.read(file):
+    for experiment in experiments:
         task = task_name(experiment.env, experiment.options)
-        if metric == "reward" and task in ruler.TASKS:
-            experts[task] = ruler.TASKS[task].expert
-        elif metric == "reward" and task not in experts and (played := _expert(experiment)) is not None:
-            experts[task] = played
         for run in experiment.runs:
             if metric not in run.metrics:
                 raise ValueError(f"--metric must be one of {', '.join(run.metrics)} in {file}, got `{metric}`")
             # `endless-reproduce` has a folder for each run of an experiment, which has a name.
             is_named = re.fullmatch(r"seed-\d+", file.parent.name)
-            # The paper calls the agent without memory by its algorithm.
-            agent = file.parent.parent.name if is_named else re.sub(r"^ppo$", "none", experiment.label)
+            agent = file.parent.parent.name if is_named else results.own_name(experiment.label)
             found.append(Score(agent, task, run.seed, run.metrics[metric][-1], run.steps[-1], run.run, run.cost))
+        if metric == "reward" and task in ruler.TASKS:
+            experts[task] = ruler.TASKS[task].expert
+        elif metric == "reward" and task not in experts and (played := _expert(experiment)) is not None:
+            experts[task] = played
     return found
 
 
 def _expert(experiment: results.Experiment) -> float | None:
     """Mean return of the scripted expert in the environment of an experiment; None if it has none."""
-    options = tuple(f"{name}={json.dumps(value)}" for name, value in experiment.options.items())
+    options = command.assignments(experiment.options)
     try:
         spec(experiment.env)
         return ruler.mean_return(ruler.Task("", "object", experiment.env, 0, 0, options), expert=True)
@@ -491,8 +489,8 @@ def seed_cells(comparison: Comparison, task: str) -> tuple[list[str], list[list[
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """The lines of a table whose first column has names of agents, and the others numbers."""
-    lines = [f"| {' | '.join(columns)} |", f"| --- |{' ---: |' * (len(columns) - 1)}"]
-    return lines + [f"| `{row[0]}` | {' | '.join(row[1:])} |" for row in rows]
+    shown = {name: name != columns[0] for name in columns}
+    return tables.markdown(shown, ([f"`{row[0]}`", *row[1:]] for row in rows))
 
 
 def markdown(comparison: Comparison, heading: str = "# Comparison") -> list[str]:
@@ -600,13 +598,6 @@ def draw(comparison: Comparison, out: Path) -> None:
                 figure.savefig(new, format=kind, metadata={date: None})
 
 
-def csv_text(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table as CSV."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    return text.getvalue()
-
-
 def write(comparison: Comparison, out: Path, page: str = "") -> list[Path]:
     """Write the tables and figures of a comparison into a folder, which is made if it does not exist.
 
@@ -624,14 +615,14 @@ def write(comparison: Comparison, out: Path, page: str = "") -> list[Path]:
     command.check_installed("a comparison", "matplotlib")
     out.mkdir(parents=True, exist_ok=True)
     pages = {"README.md": page or "\n".join([*markdown(comparison), "![comparison](comparison.svg)"]) + "\n"}
-    pages["agents.csv"] = csv_text(*cells(comparison))
+    pages["agents.csv"] = tables.csv_text(*cells(comparison))
     rows = [
         (row.task, row.agent, row.seed, row.steps, row.score, comparison.normalised(row.task, row.score))
         for row in comparison.rows
     ]
-    pages["runs.csv"] = csv_text(("task", "agent", "seed", "steps", "score", "normalised"), rows)
+    pages["runs.csv"] = tables.csv_text(("task", "agent", "seed", "steps", "score", "normalised"), rows)
     pairs = [(one.first, one.second, *asdict(one.probability).values()) for one in comparison.pairs]
-    pages["improvement.csv"] = csv_text(("first", "second", "probability", "low", "high"), pairs)
+    pages["improvement.csv"] = tables.csv_text(("first", "second", "probability", "low", "high"), pairs)
     pages["table.tex"] = latex(comparison)
     for name, text in pages.items():
         atomic.write(out / name, text)

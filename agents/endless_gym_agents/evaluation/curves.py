@@ -17,8 +17,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from endless_gym_agents.common.command import assignments
 from endless_gym_agents.evaluation.results import Experiment, label, metric
-from endless_gym_agents.evaluation.statistics import interquartile_mean, interval
+from endless_gym_agents.evaluation.statistics import interquartile_means, interval
 from endless_gym_agents.training.checkpoint import read_settings
 from endless_gym_agents.training.logs import PROGRESS, read_progress
 
@@ -63,10 +64,9 @@ class Curve:
 
     def interquartile_mean(self) -> tuple[Floats, Floats, Floats]:
         """Interquartile mean over the runs, and the ends of its 95 % interval, float64 (checkpoints,) each."""
-        means = np.array([interquartile_mean(column) for column in self.scores.T])
         tables = [column.reshape(self.tasks, -1).T for column in self.scores.T]
         ends = np.array([interval(table, repetitions=1000) for table in tables])
-        return means, ends[:, 0], ends[:, 1]
+        return interquartile_means(self.scores.T), ends[:, 0], ends[:, 1]
 
     def until(self, steps: int) -> Curve:
         """The curve up to a number of environment steps."""
@@ -116,8 +116,8 @@ def evaluated(experiment: Experiment) -> Curve:
         )
     scores = experiment.scores(name)
     # Reset parameters change the paper's task, so the label shows them.
-    options = "".join(f", {option}={value}" for option, value in experiment.options.items())
-    return Curve(experiment.env, experiment.label + options, "evaluated", steps, scores)
+    shown = ", ".join([experiment.label, *assignments(experiment.options)])
+    return Curve(experiment.env, shown, "evaluated", steps, scores)
 
 
 def training(run: Path) -> Curve:

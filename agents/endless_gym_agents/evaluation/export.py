@@ -90,8 +90,8 @@ def evaluations(agent: Agent) -> list[dict[str, Any]]:
     each = [options | {"command_count": [count]} for count in counts] if len(counts) > 1 else [options]
     found = []
     for chosen in each:
-        given = tuple(f"{name}={json.dumps(value)}" for name, value in chosen.items())
-        agent.settings = replace(trained, environment=replace(trained.environment, option=given))
+        option = command.assignments(chosen)
+        agent.settings = replace(trained, environment=replace(trained.environment, option=option))
         try:
             results = evaluate(agent, num_threads=1)
         finally:

@@ -13,10 +13,8 @@ endless-plot runs/mine                               # the training rewards of a
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +25,7 @@ import numpy as np
 import tyro
 
 from endless_gym.program.printable import printable
-from endless_gym_agents.common import atomic, command
+from endless_gym_agents.common import atomic, command, tables
 from endless_gym_agents.common.palette import AGENTS
 from endless_gym_agents.common.ranges import Natural
 from endless_gym_agents.evaluation import compare
@@ -44,7 +42,7 @@ from endless_gym_agents.evaluation.curves import (
     published_labels,
     training,
 )
-from endless_gym_agents.evaluation.results import Experiment, metric, read
+from endless_gym_agents.evaluation.results import Experiment, metric, own_name, read
 
 Spread = Literal["std", "iqm", "runs"]
 
@@ -76,13 +74,10 @@ class PlotArguments:
 
 def estimates(curve: Curve, spread: Spread) -> list[tuple[float, ...]]:
     """A row for each checkpoint: steps, then centre, low and high; or for the spread `runs`, steps and the score of each run."""
-    columns: list[Floats] = list(curve.scores)
+    columns: Sequence[Floats] = list(curve.scores)
     if spread != "runs":
-        columns = list(curve.mean() if spread == "std" else curve.interquartile_mean())
-    return [
-        (int(step), *(float(value) for value in row))
-        for step, row in zip(curve.steps, zip(*columns, strict=True), strict=True)
-    ]
+        columns = curve.mean() if spread == "std" else curve.interquartile_mean()
+    return list(zip(curve.steps.tolist(), *(column.tolist() for column in columns), strict=True))
 
 
 @dataclass(frozen=True)
@@ -129,11 +124,10 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for number, curve in enumerate(curves):
-        rows, colour = estimates(curve, spread), AGENTS.get(curve.label, (f"C{number}",))[0]
+        own = own_name(curve.label)
+        rows, colour = estimates(curve, spread), AGENTS.get(own, (f"C{number}",))[0]
         steps = [row[0] / scale.unit for row in rows]
         style = "--" if curve.source == "published" else "-"
-        # The paper calls the agent without memory by its algorithm.
-        own = re.sub(r"^ppo\b", "none", curve.label)
         title = f"{curve.label} (paper)" if curve.source == "published" else own
         marker = "o" if len(steps) == 1 else ""
         if spread == "runs":
@@ -150,18 +144,12 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     with atomic.replacing(out / f"{name}.png") as picture:
         figure.savefig(picture, dpi=150, format="png")
 
-    with atomic.replacing(out / f"{name}.csv") as new, new.open("w", newline="") as file:
-        writer = csv.writer(file)
-        if spread == "runs":
-            writer.writerow(["source", "label", "run", scale.name, "score"])
-            for curve in curves:
-                for row in estimates(curve, spread):
-                    writer.writerows(
-                        [curve.source, curve.label, run, row[0], score] for run, score in enumerate(row[1:])
-                    )
-        else:
-            writer.writerow(["source", "label", scale.name, "mean" if spread == "std" else "iqm", "low", "high"])
-            writer.writerows([curve.source, curve.label, *row] for curve in curves for row in estimates(curve, spread))
+    columns = ["source", "label", scale.name, "mean" if spread == "std" else "iqm", "low", "high"]
+    table = [(curve.source, curve.label, *row) for curve in curves for row in estimates(curve, spread)]
+    if spread == "runs":
+        columns[2:] = ["run", scale.name, "score"]
+        table = [(*row[:2], run, row[2], score) for row in table for run, score in enumerate(row[3:])]
+    atomic.write(out / f"{name}.csv", tables.csv_text(columns, table))
     data = [
         {"env": curve.env, "label": curve.label, "source": curve.source}
         | {scale.name: curve.steps.tolist(), "scores": curve.scores.tolist()}

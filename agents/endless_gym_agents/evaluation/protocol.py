@@ -28,9 +28,9 @@ from endless_gym_agents.common import atomic, command, tables
 from endless_gym_agents.common.ranges import Natural, Positive
 from endless_gym_agents.evaluation.conformance import state_bytes
 from endless_gym_agents.evaluation.evaluate import EVALUATION_SEEDS, REPETITIONS, evaluate
-from endless_gym_agents.evaluation.results import Experiment, Experiments, Run, metric, to_json
+from endless_gym_agents.evaluation.results import Experiment, Experiments, Run, metric, own_name, to_json
 from endless_gym_agents.training import checkpoint
-from endless_gym_agents.training.logs import PROGRESS, read_progress
+from endless_gym_agents.training.logs import read_progress, update_seconds
 from endless_gym_agents.training.train import choose_device
 
 
@@ -110,9 +110,8 @@ def cost(loaded: checkpoint.Checkpoint, folder: Path) -> dict[str, float]:
         "parameters": loaded.agent.num_parameters,
         "state_bytes": state_bytes(loaded.agent.initial_memory(1).state),
     }
-    if loaded.settings.threads == 1 and (folder / PROGRESS).exists():
-        rows = read_progress(folder)
-        found["core_seconds"] = round(sum(row[name] for row in rows for name in row if name.startswith("seconds/")), 2)
+    if loaded.settings.threads == 1 and (rows := read_progress(folder)):
+        found["core_seconds"] = round(sum(update_seconds(rows)), 2)
     return found
 
 
@@ -179,12 +178,11 @@ def table(experiment: Experiment) -> Table:
     The interval is that of the interquartile mean (IQM) of the runs, or of the mean of a run's episodes. Final
     infos that count failures as successes are marked, and the caption says which metric to trust.
     """
-    options = "".join(f", {name}={value}" for name, value in experiment.options.items())
     first, _ = metric(experiment.env)
     rows = [(first, *row) for row in experiment.summaries(first)]
-    # The paper calls the agent without memory by its algorithm.
-    label = "none (ppo in the paper)" if experiment.label == "ppo" else experiment.label
-    title = f"{experiment.env}, {label}, over {rows[0][-1]}{options}"
+    label = own_name(experiment.label)
+    label += " (ppo in the paper)" if label != experiment.label else ""
+    title = ", ".join([experiment.env, label, f"over {rows[0][-1]}", *command.assignments(experiment.options)])
     others = [name for name in experiment.runs[0].metrics if name != first]
     rows += [(name, *row) for name in others for row in experiment.summaries(name)[-1:]]
     # In finite Mortar Mayhem.
@@ -206,9 +204,9 @@ def table(experiment: Experiment) -> Table:
 
 def execute(arguments: EvalArguments) -> None:
     """Evaluate the checkpoints, and write or print the results."""
-    if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
-        raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
     if arguments.json not in ("", "-"):
+        if not Path(arguments.json).resolve().parent.is_dir():
+            raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
         runs = find(arguments.paths, arguments.last)
         read = [file for _, files in runs for file in checkpoint.protected(files[0])]
         command.check_outputs([Path(arguments.json)], read)

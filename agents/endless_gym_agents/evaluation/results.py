@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -129,6 +130,11 @@ def label(settings: Settings) -> str:
     return name + "".join(addition for addition, value in additions.items() if value)
 
 
+def own_name(label: str) -> str:
+    """A label with our name of the agent without memory, `none`, which the paper calls by its algorithm, `ppo`."""
+    return re.sub(r"^ppo\b", "none", label)
+
+
 class Experiments:
     """Groups runs into experiments by their settings."""
 
@@ -196,12 +202,20 @@ def read(file: Path) -> list[Experiment]:
         ValueError: The file has another format.
     """
     try:
-        written = json.loads(regular.text(file))["experiments"]
+        content = json.loads(regular.text(file))
+    except (UnicodeDecodeError, json.JSONDecodeError):
+        content = None
+    return from_json(content, file)
+
+
+def from_json(content: Any, file: Path) -> list[Experiment]:
+    """As `read`, from the content of the file."""
+    try:
         return [
             Experiment(
                 one["env"], one["label"], one["options"], [Run(**run) for run in one["runs"]], one.get("last", False)
             )
-            for one in written
+            for one in content["experiments"]
         ]
-    except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (KeyError, TypeError) as error:
         raise ValueError(f"{file} is not a file of `endless-eval --json`") from error

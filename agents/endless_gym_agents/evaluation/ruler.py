@@ -77,10 +77,6 @@ class Task:
         """Whether an agent without memory with this mean return fails the task, as it must."""
         return memoryless < self.random + GATE * (self.expert - self.random)
 
-    def normalised(self, score: float, memoryless: float) -> float:
-        """A mean return between that of an agent without memory, 0, and that of the expert, 1."""
-        return (score - memoryless) / (self.expert - memoryless)
-
 
 def _mayhem(
     name: str, label: Label, expert: float, random: float, options: tuple[str, ...], longer: tuple[str, ...]

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Scores = NDArray[np.float64]
 #: Function from samples (samples, runs * tasks) to estimates (samples,).
-Estimate = Callable[[Scores], Scores]
+Estimator = Callable[[Scores], Scores]
 
 #: Fraction of the scores that the interquartile mean discards at each end.
 TRIMMED = 0.25
@@ -48,6 +48,12 @@ def interquartile_means(samples: Scores) -> Scores:
     return means
 
 
+def _table(scores: ArrayLike) -> Scores:
+    """Scores (runs, tasks), also of (runs,)."""
+    table = np.asarray(scores, dtype=np.float64)
+    return table[:, None] if table.ndim == 1 else table
+
+
 def _means(samples: Scores) -> Scores:
     """The mean of each row: (samples, scores) to (samples,)."""
     means: Scores = samples.mean(axis=1)
@@ -55,33 +61,25 @@ def _means(samples: Scores) -> Scores:
 
 
 def stratified_bootstrap(
-    scores: ArrayLike,
-    estimate: Estimate = interquartile_means,
-    *,
-    repetitions: int = 2000,
-    confidence: float = 0.95,
-    seed: int = 0,
+    scores: ArrayLike, estimator: Estimator = interquartile_means, *, repetitions: int = 2000
 ) -> tuple[float, float]:
-    """Percentile confidence interval of an estimate by stratified bootstrap.
+    """Percentile 95 % interval of an estimate by stratified bootstrap.
 
     Each bootstrap sample draws as many runs as there are, with replacement, for each task independently.
 
     Args:
         scores: (runs, tasks) or (runs,).
-        estimate: The estimate; the interquartile mean by default.
+        estimator: The estimator; the interquartile mean by default.
         repetitions: Number of bootstrap samples.
-        confidence: Confidence level, between 0 and 1.
-        seed: Seed of the resampling.
 
     Returns:
         The lower and the upper end of the interval.
     """
-    table = np.asarray(scores, dtype=np.float64)
-    table = table[:, None] if table.ndim == 1 else table
+    table = _table(scores)
     runs, tasks = table.shape
-    drawn = np.random.default_rng(seed).integers(runs, size=(repetitions, runs, tasks))
+    drawn = np.random.default_rng(0).integers(runs, size=(repetitions, runs, tasks))
     samples = table[drawn, np.arange(tasks)].reshape(repetitions, runs * tasks)
-    low, high = np.quantile(estimate(samples), [(1 - confidence) / 2, (1 + confidence) / 2])
+    low, high = np.quantile(estimator(samples), [0.025, 0.975])
     return float(low), float(high)
 
 
@@ -91,7 +89,7 @@ def optimality_gaps(samples: Scores) -> Scores:
     return gaps
 
 
-def _half_widths(tables: Scores, estimate: Estimate, repetitions: int, seed: int) -> Scores:
+def _half_widths(tables: Scores, estimator: Estimator, repetitions: int, seed: int) -> Scores:
     """Half of the width of the 95 % interval of an estimate of each table: (tables, runs, tasks) to (tables,); runs >= 2.
 
     The degrees of freedom are Satterthwaite's: few, if few tasks account for the variance. The jackknife says which do.
@@ -100,9 +98,9 @@ def _half_widths(tables: Scores, estimate: Estimate, repetitions: int, seed: int
     size = runs * tasks
     drawn = np.random.default_rng(seed).integers(runs, size=(repetitions, runs, tasks))
     resampled = tables[:, drawn, np.arange(tasks)].reshape(-1, size)
-    error = estimate(resampled).reshape(count, repetitions).std(axis=1) * sqrt(runs / (runs - 1))
+    error = estimator(resampled).reshape(count, repetitions).std(axis=1) * sqrt(runs / (runs - 1))
     others = np.array([np.delete(np.arange(size), left_out) for left_out in range(size)])
-    without = estimate(tables.reshape(count, size)[:, others].reshape(-1, size - 1)).reshape(count, runs, tasks)
+    without = estimator(tables.reshape(count, size)[:, others].reshape(-1, size - 1)).reshape(count, runs, tasks)
     variances = without.var(axis=1)
     squares = np.maximum((variances**2).sum(axis=1), 1e-300)
     degrees = (runs - 1) * np.clip(variances.sum(axis=1) ** 2 / squares, 1, tasks)
@@ -111,23 +109,21 @@ def _half_widths(tables: Scores, estimate: Estimate, repetitions: int, seed: int
 
 
 def interval(
-    scores: ArrayLike, estimate: Estimate = interquartile_means, *, repetitions: int = 2000, seed: int = 0
+    scores: ArrayLike, estimator: Estimator = interquartile_means, *, repetitions: int = 2000
 ) -> tuple[float, float]:
     """95 % interval of an estimate: its standard error by stratified bootstrap, corrected for few runs, times Student's t.
 
     Args:
         scores: (runs, tasks) or (runs,).
-        estimate: The estimate; the interquartile mean by default.
+        estimator: The estimator; the interquartile mean by default.
         repetitions: Number of bootstrap samples.
-        seed: Seed of the resampling.
 
     Returns:
         The lower and the upper end; of a single run, which has no interval, both are its estimate.
     """
-    table = np.asarray(scores, dtype=np.float64)
-    table = table[:, None] if table.ndim == 1 else table
-    centre = float(estimate(table.reshape(1, -1))[0])
-    half = float(_half_widths(table[None], estimate, repetitions, seed)[0]) if len(table) > 1 else 0.0
+    table = _table(scores)
+    centre = float(estimator(table.reshape(1, -1))[0])
+    half = float(_half_widths(table[None], estimator, repetitions, 0)[0]) if len(table) > 1 else 0.0
     return centre - half, centre + half
 
 
@@ -232,9 +228,9 @@ def coverage(runs: int, tasks: int, repetitions: int = 1000) -> list[Coverage]:
             draw(generator, repetitions, runs, tasks),
         )
         flat, shares = tables.reshape(repetitions, -1), []
-        for estimate in (interquartile_means, optimality_gaps):
-            error = np.abs(estimate(flat) - estimate(everything)[0])
-            shares.append(float(np.mean(error <= _half_widths(tables, estimate, 200, 1) + 1e-9)))
+        for estimator in (interquartile_means, optimality_gaps):
+            error = np.abs(estimator(flat) - estimator(everything)[0])
+            shares.append(float(np.mean(error <= _half_widths(tables, estimator, 200, 1) + 1e-9)))
         equal = _improvements(tables, draw(generator, repetitions, runs, tasks))
         ends = {p: improvement_interval(p, runs, runs, tasks) for p in np.unique(equal).tolist()}
         halves = [ends[p][0] <= 0.5 <= ends[p][1] for p in equal.tolist()]

@@ -33,7 +33,7 @@ import tyro
 from endless_gym import _native
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import Agent
-from endless_gym_agents.common import atomic, command, regular
+from endless_gym_agents.common import atomic, command, regular, tables
 from endless_gym_agents.common.ranges import Natural, Range
 from endless_gym_agents.evaluation import compare, export, protocol, ruler
 from endless_gym_agents.evaluation.compare import Comparison
@@ -435,14 +435,14 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
         "",
         *compare.markdown(comparison, "## Agents"),
         *longer_table(track, rows),
-        "| task | measures | expert | `none` | gate |",
-        "| --- | --- | ---: | ---: | --- |",
     ]
+    gates = []
     for name in comparison.tasks:
         task, zero = track.tasks[name], comparison.ranges[name][0]
         gate, label = ("passed" if task.passes_gate(zero) else "FAILED", task.label) if name in TASKS else ("", "")
-        lines.append(f"| {name} | {label} | {task.expert:g} | {zero:.3f} | {gate} |")
-    return "\n".join(lines) + "\n"
+        gates.append([name, label, f"{task.expert:g}", f"{zero:.3f}", gate])
+    columns = {"task": False, "measures": False, "expert": True, "`none`": True, "gate": False}
+    return "\n".join([*lines, *tables.markdown(columns, gates)]) + "\n"
 
 
 def longer_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -452,20 +452,16 @@ def longer_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
     if not versions:
         return []
-    lines = [
-        "Mean returns in a task, and after the arrow in a longer version of it, in which the agent did not train:",
-        "",
-        "| agent | " + " | ".join(f"{task.name} → `{version}`" for task, version in versions) + " |",
-        "| --- |" + " ---: |" * len(versions),
-    ]
-    for name in dict.fromkeys(compare.of_row(one, Path()).agent for one in rows):
-        shown = []
-        for task, _ in versions:
-            own = [one for one in rows if compare.of_row(one, Path()).agent == name and one["task"] == task.name]
-            means = [f"{statistics.mean(one[key] for one in own):.2f}" for key in ("score", "longer")] if own else []
-            shown.append(" → ".join(means))
-        lines.append(f"| `{name}` | {' | '.join(shown)} |")
-    return [*lines, ""]
+    named = [(compare.of_row(one, Path()).agent, one) for one in rows]
+
+    def means(name: str, task: str) -> str:
+        own = [one for agent, one in named if (agent, one["task"]) == (name, task)]
+        return " → ".join(f"{statistics.mean(one[key] for one in own):.2f}" for key in ("score", "longer") if own)
+
+    shown = [[name, *(means(name, task.name) for task, _ in versions)] for name in dict.fromkeys(n for n, _ in named)]
+    about = "Mean returns in a task, and after the arrow in a longer version of it, in which the agent did not train:"
+    columns = ["agent", *(f"{task.name} → `{version}`" for task, version in versions)]
+    return [about, "", *compare.markdown_table(columns, shown), ""]
 
 
 def execute(arguments: LeaderboardArguments) -> None:

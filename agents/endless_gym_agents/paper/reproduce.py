@@ -99,7 +99,7 @@ def show_status(planned: list[Job], console: Console) -> None:
             of += ", evaluation left"
         elif trained < job.updates and seconds is not None:
             of += f", {duration(seconds[number])} left"
-            of += "" if planning.update_seconds(job) else ", estimated from other runs"
+            of += "" if trained else ", estimated from other runs"
         console.print(f"{state:<11}  {job.title}{of}")
 
 

@@ -26,7 +26,7 @@ from endless_gym_agents.paper import jobs
 from endless_gym_agents.paper.search_space import STUDY, Choice, Space, single_changes, space, with_choices
 from endless_gym_agents.settings import Settings, to_dict
 from endless_gym_agents.training import checkpoint
-from endless_gym_agents.training.logs import PROGRESS, read_progress
+from endless_gym_agents.training.logs import read_progress
 from endless_gym_agents.training.train import choose_device
 
 #: Files in the folder of a search: the best settings, and the folder of the locks.
@@ -376,7 +376,7 @@ def resumable(settings: Settings) -> tuple[Settings, list[dict[str, Any]]]:
     run = Path(settings.run)
     if (run / checkpoint.SETTINGS).exists():
         settings = replace(settings, resume=settings.run)
-    return settings, read_progress(run) if (run / PROGRESS).exists() else []
+    return settings, read_progress(run)
 
 
 def _pruner(arguments: SearchArguments) -> Any:

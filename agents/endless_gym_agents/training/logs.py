@@ -164,7 +164,8 @@ def learnt(spec: Spec, means: Mapping[str, float]) -> str | None:
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:
-    """The rows of `progress.jsonl`, one per update; an incomplete last line, from a killed process, is ignored.
+    """The rows of `progress.jsonl`, one per update, none without the file; an incomplete last line, from a killed process, is
+    ignored.
 
     Raises:
         MissingRow: There is no row of an update before the last one.
@@ -172,8 +173,15 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
     return [row for row, _ in _rows(run)]
 
 
+def update_seconds(rows: Iterable[Mapping[str, Any]]) -> list[float]:
+    """Seconds of each update, of what `read_progress` returned."""
+    return [sum(value for name, value in row.items() if name.startswith("seconds/")) for row in rows]
+
+
 def _rows(run: Path) -> Iterator[tuple[dict[str, Any], int]]:
     """The rows as for `read_progress`, each with its end in bytes."""
+    if not (run / PROGRESS).exists():
+        return
     with regular.opened(run / PROGRESS) as file:
         lines, end = file.readlines(), 0
     for number, line in enumerate(lines, 1):

@@ -17,7 +17,7 @@ from endless_gym_agents.paper import jobs
 from endless_gym_agents.paper.experiments.definitions import Evaluation, Experiment, Run, Value
 from endless_gym_agents.paper.search_space import STUDY, space
 from endless_gym_agents.training import checkpoint
-from endless_gym_agents.training.logs import PROGRESS, read_progress
+from endless_gym_agents.training.logs import read_progress, update_seconds
 
 #: The scale `tiny`: one update of most runs.
 TINY = 1 / 50_000
@@ -60,8 +60,7 @@ class Job:
 
     def updates_done(self) -> int:
         """Updates in the log of the run."""
-        rows = read_progress(self.folder) if (self.folder / PROGRESS).exists() else []
-        return int(rows[-1]["update"]) if rows else 0
+        return len(read_progress(self.folder))
 
     def state(self) -> State:
         """Whether the job is done, and if not, whether it can be resumed."""
@@ -213,12 +212,6 @@ def check_folders(planned: Sequence[Job]) -> None:
                 )
 
 
-def update_seconds(job: Job) -> list[float]:
-    """Seconds of each update in the log of a job's run."""
-    rows = read_progress(job.folder) if (job.folder / PROGRESS).exists() else []
-    return [sum(value for name, value in row.items() if name.startswith("seconds/")) for row in rows]
-
-
 def evaluation_seconds(job: Job) -> float | None:
     """Time of a job's evaluation; None if it has none, or before it is done."""
     file = job.folder / EVALUATION
@@ -262,7 +255,7 @@ def seconds_left(planned: Sequence[Job]) -> list[float] | None:
         return settings.environment.num_envs * settings.ppo.steps
 
     def per_step(job: Job) -> float | None:
-        times = update_seconds(job)
+        times = update_seconds(read_progress(job.folder))
         return statistics.median(times) / steps(job) if times else None
 
     training, evaluation = _estimate(planned, per_step), _estimate(planned, evaluation_seconds)

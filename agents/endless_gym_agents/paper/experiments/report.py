@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from endless_gym_agents.common import atomic, regular
+from endless_gym_agents.common import atomic, regular, tables
 from endless_gym_agents.evaluation import results
 from endless_gym_agents.evaluation.curves import AXES, FAMILIES, Curve, aggregate, evaluated, published
 from endless_gym_agents.evaluation.plot import HOURS, draw
@@ -20,7 +19,7 @@ from endless_gym_agents.paper.experiments import planning
 from endless_gym_agents.paper.experiments.definitions import Run
 from endless_gym_agents.paper.experiments.planning import Job
 from endless_gym_agents.settings import PAPER_STEPS_PER_UPDATE, paper_run_length
-from endless_gym_agents.training.logs import read_progress
+from endless_gym_agents.training.logs import read_progress, update_seconds
 
 #: A row of a table: text or numbers by column; missing columns stay empty.
 Row = dict[str, str | float]
@@ -71,19 +70,15 @@ def write(jobs: Sequence[Job], folder: Path, scale: float) -> Path:
 def _table(rows: Sequence[Row], file: Path) -> list[str]:
     """Write a table as CSV, and return its lines in Markdown."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    with atomic.replacing(file) as new, new.open("w", newline="") as opened:
-        writer = csv.DictWriter(opened, columns)
-        writer.writeheader()
-        writer.writerows(rows)
+    atomic.write(file, tables.csv_text(columns, ([row.get(name, "") for name in columns] for row in rows)))
 
     def cell(value: str | float) -> str:
         if isinstance(value, str):
             return value
         return f"{value:,}" if isinstance(value, int) else f"{value:,.3f}" if abs(value) < 1000 else f"{value:,.0f}"
 
-    numbers = [all(not isinstance(row.get(name, 0), str) for row in rows) for name in columns]
-    lines = [f"| {' | '.join(columns)} |", f"| {' | '.join('---:' if number else '---' for number in numbers)} |"]
-    return lines + [f"| {' | '.join(cell(row.get(name, '')) for name in columns)} |" for row in rows]
+    numbers = {name: all(not isinstance(row.get(name, 0), str) for row in rows) for name in columns}
+    return tables.markdown(numbers, ([cell(row.get(name, "")) for name in columns] for row in rows))
 
 
 def _by_run(jobs: Sequence[Job]) -> list[tuple[Run, list[Job]]]:
@@ -197,7 +192,7 @@ def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]
     rows = []
     panels: dict[str, list[Curve]] = {}
     for run, own in _by_run(jobs):
-        updates = [planning.update_seconds(job) for job in own]
+        updates = [update_seconds(read_progress(job.folder)) for job in own]
         # The first update includes compilation and the start of the environments.
         seconds = np.array([value for one in updates for value in (one[1:] or one)])
         whole = paper_run_length(run.env, run.settings().agent)
