@@ -143,11 +143,21 @@ def parameters(name: str) -> str:
     return table(["reset parameter", "allowed", *map(short, specs), "meaning"], rows)
 
 
+def arguments(name: str) -> str:
+    """Arguments of the ids with their limits, the default of each id, and their meaning."""
+
+    def rows(spec: Spec) -> Iterable[tuple[str, ...]]:
+        for each in spec["arguments"]:
+            yield f"`{each['name']}`", f"`{json.dumps(each['default'])}`", allowed(each), each["description"]
+
+    return table(["ids", "argument", "default", "allowed", "meaning"], merged(family(name), rows))
+
+
 def allowed(parameter: dict[str, Any]) -> str:
     """The values of a reset parameter, in words."""
     kind, limits = parameter["type"], (parameter.get("min"), parameter.get("max"))
-    if kind == "bool":
-        return "true or false"
+    if kind in ("bool", "choice"):
+        return " or ".join(parameter.get("choices", ("true", "false")))
     noun = {"int": "integer", "float": "number", "int_list": "list of integers"}[kind]
     if limits == (-(2**63), 2**63 - 1):
         return noun
@@ -273,6 +283,7 @@ PARTS = {
     "choices": choices,
     "actions": actions,
     "parameters": parameters,
+    "arguments": arguments,
     "infos": infos,
     "ground-truth": ground_truth,
     "features": features,

@@ -18,6 +18,7 @@ ENTRIES = {
     "popgym-AutoencodeEasy-v0": (2 + 4 + 4 + 2, 2 + 4),
     "popgym-CountRecallEasy-v0": (2 + 2 + 27 + 2, 2 + 2),
     "popgym-BattleshipEasy-v0": (2 + 8 + 8 + 2, 2),
+    "popgym-BattleshipEasy-v0?board_size=9": (2 + 9 + 9 + 2, 2),
     "popgym-PositionOnlyCartPoleEasy-v0": (2, 2),
 }
 
@@ -42,7 +43,7 @@ def test_a_run_in_an_environment_of_integers_resumes_and_is_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = "--environment.num-envs 2 --ppo.steps 4 --ppo.minibatches 1 --recurrence.hidden-size 8 --ppo.updates 2"
-    run = train(parse(f"--env popgym-AutoencodeEasy-v0 --preset quick {small} --run {tmp_path / 'run'}".split()))
+    run = train(parse(f"--env popgym-AutoencodeEasy-v0?num_decks=2 --preset quick {small} --run {tmp_path / 'run'}".split()))
     train(parse(f"--resume {run} --ppo.updates 3".split()))
     assert checkpoint.load(run).update == 3
     film = tmp_path / "film.webp"

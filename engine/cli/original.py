@@ -1,5 +1,6 @@
 """Measures the steps per second of the original with random actions, resets included. Prints one number."""
 
+import json
 import os
 import sys
 import time
@@ -13,7 +14,11 @@ import gymnasium  # noqa: E402
 
 __import__("popgym" if sys.argv[1].startswith("popgym-") else "memory_gym")
 
-env = gymnasium.make(sys.argv[1], disable_env_checker=True).unwrapped
+name, is_changed, _ = sys.argv[1].partition("?")
+env = gymnasium.make(name, disable_env_checker=True).unwrapped
+if is_changed:
+    # The class without a difficulty takes arguments.
+    env = type(env).__base__(**{each["name"]: each["default"] for each in json.loads(sys.argv[3])})
 env.action_space.seed(0)
 actions = [env.action_space.sample() for _ in range(1009)]
 env.reset(seed=0)

@@ -107,7 +107,12 @@ fn replay_recorded(family: &str) {
     assert!(traces.iter().map(replay).sum::<usize>() > 100);
 }
 
-/// Steps of each id that are compared with the live original.
+/// Ids with arguments, several for each argument of each class of the original.
+fn with_arguments() -> Vec<String> {
+    serde_json::from_reader(File::open(reference().join("popgym/arguments.json")).unwrap()).unwrap()
+}
+
+/// Steps of each id that are compared with the live original; a fifth of that with arguments.
 const LIVE_STEPS: usize = 5_000;
 
 /// Compares a family with the original, popgym[navigation]==1.0.7, in a separate process.
@@ -118,11 +123,12 @@ fn compare_live(family: &str) {
         Some(_) => rand::make_rng(),
         None => rand::SeedableRng::seed_from_u64(1),
     };
-    for level in ["Easy", "Medium", "Hard"] {
-        let id = format!("popgym-{family}{level}-v0");
+    let is_of_family = |id: &String| id.starts_with(&format!("popgym-{family}"));
+    let levels = popgym().specs().map(|spec| spec.id.to_owned());
+    for id in levels.chain(with_arguments()).filter(is_of_family) {
         let parameters = popgym().spec(&id).unwrap().parameters;
-        let mut steps = 0;
-        while steps < given.unwrap_or(LIVE_STEPS) {
+        let (mut steps, share) = (0, if id.contains('?') { 5 } else { 1 });
+        while steps < given.unwrap_or(LIVE_STEPS) / share {
             let mut options = Map::new();
             for parameter in parameters {
                 if let endless_gym::envs::ParameterKind::Float { min, max, .. } = parameter.kind

@@ -1,7 +1,7 @@
 """POPGym's wrappers, for single and for vector environments, without the package `popgym`, and its classes of environments.
 
 `RepeatPreviousEasy()` and the like are single environments, by the names of the original's classes. A class without a difficulty
-takes the original's arguments, if they are those of a difficulty: `RepeatPrevious(num_decks=2, k=32)`.
+takes the original's arguments, `RepeatPrevious(k=2)`.
 """
 
 from __future__ import annotations
@@ -22,59 +22,21 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym.env import Env, popgym_class
-from endless_gym.specs import json_text
+from endless_gym.specs import all_specs, json_text, spec, with_arguments
 from endless_gym.vector import EndlessVectorEnv
 
 #: Single or vector environments.
 Envs = Any
 
 _LEVELS = ("Easy", "Medium", "Hard")
-#: For each class of the original without a difficulty, its arguments with their defaults, and what each difficulty changes.
-_CLASSES: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {
-    "Autoencode": ({"num_decks": 1}, [{}, {"num_decks": 2}, {"num_decks": 3}]),
-    "Battleship": ({"board_size": 10, "ship_sizes": [2, 3, 3, 4]}, [{"board_size": 8}, {}, {"board_size": 12}]),
-    "Concentration": (
-        {"num_decks": 1, "deck_type": "ranks"},
-        [{"deck_type": "colors"}, {"num_decks": 2, "deck_type": "colors"}, {}],
-    ),
-    "CountRecall": (
-        {"num_decks": 1, "error_clamp": 0.5, "deck_type": "colors"},
-        [{}, {"num_decks": 2, "deck_type": "suits"}, {"num_decks": 4, "deck_type": "ranks"}],
-    ),
-    "HigherLower": ({"num_decks": 1}, [{}, {"num_decks": 2}, {"num_decks": 3}]),
-    **{
-        f"Labyrinth{task}": (
-            {"maze_dims": [10, 10], "episode_length": 1024},
-            [{}, {"maze_dims": [14, 14]}, {"maze_dims": [18, 18]}],
-        )
-        for task in ("Escape", "Explore")
-    },
-    "MineSweeper": ({"difficulty": "easy"}, [{}, {"difficulty": "medium"}, {"difficulty": "hard"}]),
-    "MultiarmedBandit": (
-        {"num_bandits": 10, "episode_length": 200},
-        [{}, {"num_bandits": 20, "episode_length": 400}, {"num_bandits": 30, "episode_length": 600}],
-    ),
-    **{
-        f"Noisy{system}": (
-            {"noise_sigma": 0.1, "max_episode_length": 200},
-            [{}, {"noise_sigma": 0.2}, {"noise_sigma": 0.3}],
-        )
-        for system in ("PositionOnlyCartPole", "PositionOnlyPendulum")
-    },
-    **{
-        f"{shown}OnlyCartPole": (
-            {"max_episode_length": 200},
-            [{}, {"max_episode_length": 400}, {"max_episode_length": 600}],
-        )
-        for shown in ("Position", "Velocity")
-    },
-    "PositionOnlyPendulum": (
-        {"max_episode_length": 200},
-        [{}, {"max_episode_length": 150}, {"max_episode_length": 100}],
-    ),
-    "RepeatFirst": ({"num_decks": 1}, [{}, {"num_decks": 8}, {"num_decks": 16}]),
-    "RepeatPrevious": ({"num_decks": 1, "k": 4}, [{}, {"num_decks": 2, "k": 32}, {"num_decks": 3, "k": 64}]),
+#: What the ids of a class of the original start with. One class has another spelling.
+_CLASSES = {
+    id.removeprefix("popgym-").removesuffix("Easy-v0").replace("Cartpole", "CartPole"): id.removesuffix("Easy-v0")
+    for id in all_specs()
+    if id.startswith("popgym-") and id.endswith("Easy-v0")
 }
+#: The difficulties that have the defaults of a class, where that is not Easy.
+_DEFAULTS = {"Battleship": "Medium", "Concentration": "Hard"}
 
 
 def __getattr__(name: str) -> Any:
@@ -93,31 +55,22 @@ def __dir__() -> list[str]:
 
 def _family(family: str) -> list[type[Env]]:
     """The class of a family without a difficulty, and those of its difficulties."""
-    defaults, changes = _CLASSES[family]
+    ids = {level: f"{_CLASSES[family]}{level}-v0" for level in _LEVELS}
+    default = spec(ids[_DEFAULTS.get(family, "Easy")])
     keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD
-    signature = inspect.Signature([inspect.Parameter(name, keyword, default=value) for name, value in defaults.items()])
-    # The id has another spelling than the class.
-    ids = [f"popgym-{family.replace('VelocityOnlyCartPole', 'VelocityOnlyCartpole')}{level}-v0" for level in _LEVELS]
-    variants = [{**defaults, **change} for change in changes]
+    signature = inspect.Signature(
+        [inspect.Parameter(name, keyword, default=value) for name, value in default.arguments.items()]
+    )
 
     def general(self: Env, *args: Any, render_mode: str | None = None, **kwargs: Any) -> None:
-        bound = signature.bind(*args, **kwargs)
-        bound.apply_defaults()
-        # The original does not use it, either.
-        given = {name: value for name, value in bound.arguments.items() if name != "error_clamp"}
-        for id, variant in zip(ids, variants, strict=True):
-            if json.loads(json_text(given)) == {name: variant[name] for name in given}:
-                Env.__init__(self, id, render_mode)
-                return
-        allowed = "; ".join(", ".join(f"{name}={variant[name]!r}" for name in given) for variant in variants)
-        raise ValueError(
-            f"{family} must have the arguments of one of its difficulties, {allowed}; "
-            f"got {', '.join(f'{name}={value!r}' for name, value in given.items())}"
-        )
+        given = dict(signature.bind(*args, **kwargs).arguments)
+        arguments = json.loads(json_text({**default.arguments, **given}))
+        same = (id for id in ids.values() if spec(id).arguments == arguments)
+        Env.__init__(self, next(same, None) or with_arguments(default.id, given), render_mode)
 
     def of(id: str) -> Any:
         def specific(self: Env, render_mode: str | None = None, **kwargs: Any) -> None:
-            Env.__init__(self, id, render_mode, **kwargs)
+            Env.__init__(self, with_arguments(id, kwargs), render_mode, **kwargs)
 
         return specific
 
@@ -125,7 +78,7 @@ def _family(family: str) -> list[type[Env]]:
         return type(name, (base,), {"__init__": init, "__doc__": doc, "__module__": __name__})
 
     base = kind(family, popgym_class(), general, f"The class `{family}` of POPGym.")
-    return [base, *(kind(family + level, base, of(id), f"`{id}`.") for level, id in zip(_LEVELS, ids, strict=True))]
+    return [base, *(kind(family + level, base, of(id), f"`{id}`.") for level, id in ids.items())]
 
 
 class PreviousAction(VectorWrapper):

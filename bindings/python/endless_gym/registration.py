@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from endless_gym.env import Env
-from endless_gym.specs import Spec, add_specs, all_specs
+from endless_gym.specs import Spec, add_specs, all_specs, with_arguments
 
 if TYPE_CHECKING:
     from endless_gym.vector import EndlessVectorEnv
@@ -57,8 +57,8 @@ def _register(specs: Iterable[Spec], namespace: str | None) -> None:
 
 
 def single(env_id: str, **kwargs: Any) -> Env:
-    """The entry point of `gymnasium.make`; keyword arguments are those of `Env`."""
-    return Env(env_id, **kwargs)
+    """The entry point of `gymnasium.make`; keyword arguments are those of `Env` and of the id."""
+    return Env(with_arguments(env_id, kwargs), **kwargs)
 
 
 # Gymnasium reads the render modes of an entry point.
@@ -66,8 +66,8 @@ single.metadata = Env.metadata  # type: ignore[attr-defined]
 
 
 def vector(env_id: str, num_envs: int = 1, **kwargs: Any) -> EndlessVectorEnv:
-    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
+    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec` and of the id."""
     # Only vector environments need Gymnasium 1.1.
     from endless_gym.create import make_vec
 
-    return make_vec(env_id, num_envs, **kwargs)
+    return make_vec(with_arguments(env_id, kwargs), num_envs, **kwargs)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
@@ -199,6 +201,8 @@ class Spec:
     feature_columns: tuple[Meaning, ...]
     #: Reset parameters with their defaults.
     reset_parameters: dict[str, Any]
+    #: Arguments of the id with its values.
+    arguments: dict[str, Any]
     #: The number by which agents are compared.
     metric: Metric
     #: When the task counts as learnt; `None` for a task whose episodes get longer the better the agent is.
@@ -223,6 +227,13 @@ class Spec:
         return (
             self.id if self.module == _native.__name__ else f"{self.module.rpartition('.')[0] or self.module}:{self.id}"
         )
+
+    def registered(self) -> gymnasium.envs.registration.EnvSpec | None:
+        """A copy of the id's entry in Gymnasium's registry; `None` for an id that is not registered."""
+        entry = deepcopy(gymnasium.registry.get(f"EndlessGym/{self.id.partition('?')[0]}"))
+        if entry is not None:
+            entry.kwargs["env_id"] = self.full_id
+        return entry
 
     @property
     def default_observation(self) -> ObservationName:
@@ -359,7 +370,7 @@ def add_specs(native: ModuleType) -> Iterable[Spec]:
 
 def spec(id: str) -> Spec:
     """The specification of an id, with or without the prefix `EndlessGym/`. As for `gymnasium.make`, `module:id` imports a module
-    first, which registers the id.
+    first, which registers the id. The id may have arguments, as in `popgym-RepeatPreviousEasy-v0?k=2`.
 
     Examples:
         >>> import endless_gym
@@ -371,7 +382,8 @@ def spec(id: str) -> Spec:
 
     Raises:
         TypeError: The id is not a string.
-        ValueError: The module cannot be imported, or there is no such id; the message has the likely ids, or all.
+        ValueError: The module cannot be imported, or there is no such id; the message has the likely ids, or all. Or an argument
+            is unknown or out of its range.
     """
     if not isinstance(id, str):
         raise TypeError(f"id must be a string, got {id!r}")
@@ -381,12 +393,25 @@ def spec(id: str) -> Spec:
             import_module(module)
     except ImportError as error:
         raise ValueError(f"id must name a module that can be imported, got {id!r}: {error}") from error
-    name = name.removeprefix("EndlessGym/")
+    name, _, arguments = name.removeprefix("EndlessGym/").partition("?")
     if name not in _SPECS:
         if likely := _native.likely_ids(name, list(_SPECS)):
             raise ValueError(f"id must be one of endless_gym.all_specs(), got {id!r}; did you mean {likely}?")
         raise ValueError(f"id must be one of {', '.join(_SPECS)}, got {id!r}")
-    return _SPECS[name]
+    return _with_arguments(name, arguments) if arguments else _SPECS[name]
+
+
+@cache
+def _with_arguments(id: str, arguments: str) -> Spec:
+    module = _SPECS[id].native
+    return described_spec(json.loads(module.spec(f"{id}?{arguments}")), module.__name__)
+
+
+def with_arguments(id: str, given: dict[str, Any]) -> str:
+    """The id with those of its arguments that are given, which are removed from `given`."""
+    values = {name: given.pop(name) for name in spec(id).arguments if name in given}
+    texts = (f"{name}={value if isinstance(value, str) else json_text(value)}" for name, value in values.items())
+    return f"{id}{'&' if '?' in id else '?'}{'&'.join(texts)}" if values else id
 
 
 def contents(described: Spec, observation: ObservationName | None, frames: Frames | None) -> tuple[Frames | None, bool]:
@@ -448,6 +473,7 @@ def described_spec(described: dict[str, Any], module: str = _native.__name__) ->
         described_features=described["observation_space"],
         feature_columns=_meanings(described["features"]),
         reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
+        arguments={argument["name"]: argument["default"] for argument in described["arguments"]},
         metric=Metric(**described["metric"]),
         learnt=None if described["learnt"] is None else Learnt(**described["learnt"]),
         render_fps=described["render_fps"],

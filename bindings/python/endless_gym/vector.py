@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
@@ -106,7 +105,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._results = results
         self._described = described
         #: The id's entry in Gymnasium's registry; `None` for an id that is not registered, such as one of an engine of your own.
-        self.spec = deepcopy(gymnasium.registry.get(f"EndlessGym/{described.id}"))
+        self.spec = described.registered()
         self.num_envs = num_envs = results.num_envs
         self.num_groups = backend.groups
         self.single_observation_space = results.observation_space

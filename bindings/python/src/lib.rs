@@ -54,11 +54,18 @@ fn specs() -> PyResult<String> {
     serde_json::to_string(&specs).map_err(|error| PyRuntimeError::new_err(error.to_string()))
 }
 
+/// The specification of an environment, whose id may have arguments, as JSON text.
+#[pyfunction]
+fn spec(id: &str) -> PyResult<String> {
+    let spec = environments().spec(id).map_err(|error| PyValueError::new_err(error.to_string()))?;
+    serde_json::to_string(spec).map_err(|error| PyRuntimeError::new_err(error.to_string()))
+}
+
 /// The ids of `known` that an unknown one may stand for, such as `A-v0 or B-v0`; `None` if there are none.
 #[cfg(feature = "native")]
 #[pyfunction]
 fn likely_ids(id: String, known: Vec<String>) -> Option<String> {
-    UnknownEnvironment { id, known: known.join(", ") }.likely()
+    UnknownEnvironment { id, known: known.join(", "), problem: None }.likely()
 }
 
 /// The maximum number of steps of an episode with reset parameters, an object of JSON; -1 without a limit, or if this module does not
@@ -136,5 +143,6 @@ pub fn populate(module: &Bound<'_, PyModule>, registry: Result<Registry, Registr
     module.add_function(wrap_pyfunction!(ends::ended_episodes, module)?)?;
     module.add_function(wrap_pyfunction!(endless, module)?)?;
     module.add_function(wrap_pyfunction!(max_episode_steps, module)?)?;
+    module.add_function(wrap_pyfunction!(spec, module)?)?;
     module.add_function(wrap_pyfunction!(specs, module)?)
 }

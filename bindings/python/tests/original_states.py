@@ -1,4 +1,5 @@
-"""The Markov states of POPGym's environments. As a program, it prints those of the original, `popgym`, as JSON.
+"""The spaces, Markov states, observations, rewards and ends of POPGym's environments. As a program, it prints those of the original,
+`popgym`, as JSON.
 
 `tests/reference/popgym/states.json.gz` has what it printed for popgym 1.0.7 and the seed 20261128.
 """
@@ -8,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import zlib
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -23,13 +25,13 @@ def checksum(state: Any) -> int:
 
 
 def states(env: Any, seed: int) -> dict[str, Any]:
-    """The space of the states, whether the best policy needs the previous action, and checksums of the states of two episodes."""
+    """Checksums of the spaces and of all steps of two episodes, and whether the best policy needs the previous action."""
     random = np.random.default_rng(seed)
     found = []
     for episode_seed in (seed, None):
-        env.reset(seed=episode_seed)
+        observation, _ = env.reset(seed=episode_seed)
         is_running = True
-        found.append(checksum(env.get_state()))
+        found.append(checksum((env.get_state(), observation)))
         while is_running:
             space = env.action_space
             if isinstance(space, gymnasium.spaces.Discrete):
@@ -38,12 +40,12 @@ def states(env: Any, seed: int) -> dict[str, Any]:
                 action = random.integers(space.nvec)
             else:
                 action = random.uniform(space.low, space.high).astype(np.float32)
-            _, _, terminated, truncated, _ = env.step(action)
+            observation, reward, terminated, truncated, _ = env.step(action)
             is_running = not (terminated or truncated)
-            found.append(checksum(env.get_state()))
+            found.append(checksum((env.get_state(), observation, reward, bool(terminated), bool(truncated))))
     # The text of a space leaves out long vectors.
     return {
-        "space": checksum(repr(flat(env.state_space))),
+        "spaces": [checksum(repr(flat(of))) for of in (env.observation_space, env.action_space, env.state_space)],
         "needs_action": env.obs_requires_prev_action,
         "states": found,
     }
@@ -58,7 +60,9 @@ def flat(space: gymnasium.Space[Any]) -> list[Any]:
 
 
 if __name__ == "__main__":
-    import popgym
+    reference = Path(__file__).parents[3] / "tests/reference/popgym"
+    sys.path.insert(0, str(reference))
+    from original import IDS, made
 
-    made = {each["id"]: kind for kind, each in popgym.envs.ALL.items()}
-    print(json.dumps({id: states(kind(), int(sys.argv[1])) for id, kind in made.items()}, separators=(",", ":")))
+    ids = [*IDS, *json.loads((reference / "arguments.json").read_text())]
+    print(json.dumps({id: states(made(id), int(sys.argv[1])) for id in ids}, separators=(",", ":")))

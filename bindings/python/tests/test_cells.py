@@ -33,6 +33,7 @@ IDS = [
     "popgym-CountRecallEasy-v0",
     "popgym-PositionOnlyPendulumEasy-v0",
     "popgym-BattleshipEasy-v0",
+    "popgym-RepeatPreviousEasy-v0?k=2",
 ]
 
 TYPES = json.loads(Path(__file__).with_name("original_types.json").read_text())
@@ -184,7 +185,7 @@ def test_environments_have_pictures_or_text(id: str, where: str) -> None:
             made(render_mode="ansi")
     else:
         for observation in ("rgb", "rgb+features"):
-            with pytest.raises(ValueError, match=rf'{id} has no frames; use observation="features"'):
+            with pytest.raises(ValueError, match=rf'{re.escape(id)} has no frames; use observation="features"'):
                 made(observation=observation)
     for mode in ["rgb_array", "debug_rgb_array"] if has_frames else ["rgb_array", "debug_rgb_array", "ansi"]:
         with contextlib.closing(made(render_mode=mode)) as env:

@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import random
+import re
 import subprocess
 import sys
 import threading
@@ -26,6 +27,8 @@ from endless_gym.recording.players import ExpertPlayer, Player, RandomPlayer
 
 REFERENCE = Path(__file__).parents[3] / "tests/reference/popgym"
 IDS = [id for id in endless_gym.all_specs() if id.startswith("popgym-")]
+#: Ids with arguments, several for each argument of each class of the original.
+ARGUMENTS = json.loads((REFERENCE / "arguments.json").read_text())
 FAMILIES = sorted({id.removeprefix("popgym-").replace("Easy", "").removesuffix("-v0") for id in IDS if "Easy" in id})
 
 
@@ -74,7 +77,7 @@ def test_a_single_environment_plays_recorded_episodes(family: str) -> None:
 
 def test_states_are_the_originals() -> None:
     expected = recorded("states")
-    assert set(expected) == set(IDS)
+    assert set(expected) == {*IDS, *ARGUMENTS}
     for id, described in expected.items():
         assert original_states.states(endless_gym.Env(id), 20261128) == described, id
 
@@ -89,7 +92,7 @@ def test_states_are_those_of_the_live_original() -> None:
 
 
 @pytest.mark.parametrize("make", [endless_gym.make_vec, endless_gym.serve])
-@pytest.mark.parametrize("id", [id for id in IDS if "Easy" in id])
+@pytest.mark.parametrize("id", [*(id for id in IDS if "Easy" in id), *(id for id in ARGUMENTS if "size" in id)])
 def test_batches_have_the_states(id: str, make: Any) -> None:
     single = endless_gym.Env(id)
     single.reset(seed=5)
@@ -296,7 +299,7 @@ def test_the_classes_of_the_original_are_its_ids(family: str) -> None:
         assert type(again) is type(env) and same(again.get_state(), env.get_state())
 
 
-def test_the_original_s_arguments_choose_a_difficulty() -> None:
+def test_the_original_s_arguments_are_those_of_an_id() -> None:
     popgym = endless_gym.popgym
     for env, id in [
         (popgym.RepeatPrevious(k=32, num_decks=2), "RepeatPreviousMedium"),
@@ -305,11 +308,50 @@ def test_the_original_s_arguments_choose_a_difficulty() -> None:
         (popgym.Concentration(deck_type="colors"), "ConcentrationEasy"),
         (popgym.Concentration(), "ConcentrationHard"),
         (popgym.LabyrinthEscape((14, 14)), "LabyrinthEscapeMedium"),
-        (popgym.CountRecall(error_clamp=2.0), "CountRecallEasy"),
+        (popgym.MineSweeper("medium"), "MineSweeperMedium"),
     ]:
         assert env._spec.id == f"popgym-{id}-v0"
-    with pytest.raises(ValueError, match=r"one of its difficulties, num_decks=1, k=4; .*; got num_decks=1, k=2$"):
-        popgym.RepeatPrevious(k=2)
+    for env, id in [
+        (popgym.RepeatPrevious(k=2), "RepeatPreviousEasy-v0?k=2"),
+        (popgym.RepeatPrevious(2, k=np.int64(2)), "RepeatPreviousEasy-v0?num_decks=2&k=2"),
+        (popgym.RepeatPreviousMedium(k=2), "RepeatPreviousMedium-v0?k=2"),
+        (popgym.Battleship(ship_sizes=np.array([4, 2])), "BattleshipMedium-v0?ship_sizes=4,2"),
+        (popgym.Battleship(board_size=5), "BattleshipMedium-v0?board_size=5"),
+        (popgym.Concentration(3), "ConcentrationHard-v0?num_decks=3"),
+        (popgym.CountRecall(error_clamp=2), "CountRecallEasy-v0?error_clamp=2.0"),
+        (popgym.LabyrinthExplore((8, 20), 99), "LabyrinthExploreEasy-v0?maze_dims=8,20&episode_length=99"),
+        (popgym.NoisyPositionOnlyPendulum(noise_sigma=0.25, g=9), "NoisyPositionOnlyPendulumEasy-v0?g=9.0&noise_sigma=0.25"),
+        (popgym.VelocityOnlyCartPole(sutton_barto_reward=True), "VelocityOnlyCartpoleEasy-v0?sutton_barto_reward=true"),
+        (gymnasium.make("EndlessGym/popgym-RepeatPreviousEasy-v0", k=3, num_decks=1), "RepeatPreviousEasy-v0?k=3"),
+        (gymnasium.make_vec("EndlessGym/popgym-RepeatPreviousEasy-v0", 2, k=3), "RepeatPreviousEasy-v0?k=3"),
+        (endless_gym.Env("EndlessGym/popgym-RepeatPreviousEasy-v0?k=3&k=4"), "RepeatPreviousEasy-v0"),
+    ]:
+        own: Any = env.unwrapped
+        described = own._described if isinstance(env, gymnasium.vector.VectorEnv) else own._spec
+        assert described.id == f"popgym-{id}" and endless_gym.spec(described.id) == described
+        env.reset(seed=1)
+    remade: Any = gymnasium.make(endless_gym.make_vec("popgym-RepeatPreviousEasy-v0?k=3").spec).unwrapped
+    assert remade._spec.id == "popgym-RepeatPreviousEasy-v0?k=3" and len(endless_gym.all_specs()) == 58
+    for wrong, message in [
+        (lambda: popgym.RepeatPrevious(k=0), "argument `k` must be an integer, 1 to 3275, got 0"),
+        (lambda: popgym.RepeatPrevious(k=52), "argument `k` must be less than the number of cards, 52, got 52"),
+        (lambda: popgym.RepeatPrevious(num_decks=64), "argument `num_decks` must be an integer, 1 to 63, got 64"),
+        (lambda: popgym.RepeatPrevious(k="a&b"), "argument `k` must be an integer, 1 to 3275, got a"),
+        (lambda: popgym.Concentration(deck_type="suits"), "argument `deck_type` must be colors or ranks, got suits"),
+        (lambda: popgym.MineSweeper("easier"), "argument `difficulty` must be easy or medium or hard, got easier"),
+        (lambda: popgym.LabyrinthEscape((7, 8)), "argument `maze_dims` must be two even numbers, 6 to 62, got [7, 8]"),
+        (lambda: popgym.LabyrinthEscape([8]), "argument `maze_dims` must be two even numbers, 6 to 62, got [8]"),
+        (lambda: popgym.Battleship(4), "argument `ship_sizes` must be at most 8 ships that always fit on a board of 4×4"),
+        (lambda: popgym.Battleship(2, [2, 2]), "argument `ship_sizes` must be at most 8 ships that always fit on a board"),
+        (lambda: popgym.Battleship(20, [1] * 9), "argument `ship_sizes` must be at most 8 ships that always fit on a board"),
+        (lambda: popgym.MultiarmedBandit(episode_length=0), "argument `episode_length` must be an integer, 1 to "),
+        (lambda: popgym.NoisyPositionOnlyCartPole(noise_sigma=-1), "argument `noise_sigma` must be a number, 0 to 1000000, got"),
+        (lambda: popgym.PositionOnlyCartPole(1), "argument `sutton_barto_reward` must be true or false, got 1"),
+        (lambda: endless_gym.Env(f"{IDS[0]}?k"), f"{IDS[0]} has no argument `k`; it has num_decks"),
+        (lambda: endless_gym.make_vec("MysteryPath-v0?k=2"), "MysteryPath-v0 has no argument `k`; it has none"),
+    ]:
+        with pytest.raises(ValueError, match=f"^no environment `.*`; {re.escape(message)}"):
+            wrong()
     with pytest.raises(TypeError, match="unexpected keyword argument 'decks'"):
         popgym.RepeatPrevious(decks=2)
     assert "RepeatPreviousEasy" in dir(popgym)

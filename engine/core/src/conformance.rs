@@ -448,5 +448,6 @@ fn limits(parameter: &Parameter) -> Vec<Json> {
         ParameterKind::Int { min, max, .. } => vec![json!(min), json!(max)],
         ParameterKind::Float { min, max, .. } => vec![json!(min), json!(max)],
         ParameterKind::IntList { min, max, .. } => vec![json!([min]), json!([max]), json!([min, max])],
+        ParameterKind::Choice { choices, .. } => choices.iter().map(|choice| json!(choice)).collect(),
     }
 }

@@ -83,8 +83,7 @@ pub(crate) fn toys() -> &'static Registry {
         let two = EnvSpec::new("Toy-Vector-v0", "Two branches", ActionSpace::multi_discrete(&[3, 3]));
         let specs = [EnvSpec { frame: FRAME, vector_observation: 5, features: FEATURES, ..two }, plain()];
         for spec in specs {
-            let id = spec.id;
-            registry.register::<TaskEnv<Toy>>(spec, id).unwrap();
+            registry.register::<TaskEnv<Toy>>(spec, ()).unwrap();
         }
         registry
     });

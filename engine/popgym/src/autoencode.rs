@@ -1,18 +1,16 @@
 //! Autoencode: watch a deck, then name its suits in reverse order.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ParameterError, ResetParameters, StatePart, Task,
+    Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{DECK, Deck, Face};
-use crate::ids::{INTEGER_ZERO, SUITS, ids, place, shape};
+use crate::deck::{DECK, DECKS, Deck, Face, decks};
+use crate::ids::{INTEGER_ZERO, SUITS, levels, shape};
 use crate::pictures::{self, ALONE, PICTURE};
-
-const IDS: [&str; 3] = ids!("Autoencode");
-const DECKS: [usize; 3] = [1, 2, 3];
 
 /// Number of decks, and the reward.
 pub struct Parameters {
@@ -47,26 +45,28 @@ impl Task for Autoencode {
                 ObservationSpace::Discrete(4),
             ])),
             types: INTEGER_ZERO,
+            arguments: &[DECKS],
             picture: Some(PICTURE),
-            ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
+            ..EnvSpec::new("Autoencode", summary, ActionSpace::Discrete(4))
         }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        let spec = |(id, decks): (_, usize)| {
-            let suits = "suits of the deck, 0 to 3, from the card that is dealt last";
-            let state = vec![
-                StatePart::integers("deck", 4, shape(&[decks * DECK]), "int64", suits),
-                StatePart::integer("mode", 2, "1 while the agent watches, 0 when it names suits"),
-                StatePart::shares("left", &[1], "share of the deck that has been dealt and not named"),
-            ];
-            EnvSpec { id, markov_state: state.leak(), ..Self::spec() }
-        };
-        IDS.into_iter().zip(DECKS).map(spec).collect()
+        levels::<Self>(Self::spec(), ["", "num_decks=2", "num_decks=3"])
+    }
+
+    fn with_arguments(spec: EnvSpec, parameters: &Parameters) -> Result<EnvSpec, ParameterError> {
+        let suits = "suits of the deck, 0 to 3, from the card that is dealt last";
+        let state = vec![
+            StatePart::integers("deck", 4, shape(&[parameters.decks * DECK]), "int64", suits),
+            StatePart::integer("mode", 2, "1 while the agent watches, 0 when it names suits"),
+            StatePart::shares("left", &[1], "share of the deck that has been dealt and not named"),
+        ];
+        Ok(EnvSpec { markov_state: state.leak(), ..spec })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let decks = DECKS[place(&IDS, given.id())];
+        let decks = decks(given);
         Parameters { decks, reward: 1.0 / (decks * DECK) as f64 }
     }
 
@@ -129,7 +129,7 @@ impl Task for Autoencode {
             && (self.named == 0 || self.deck.left() == 0 && self.card == 0)
     }
 
-    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+    fn expert(_: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Memory::default()))
     }
 }

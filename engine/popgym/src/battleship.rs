@@ -3,26 +3,30 @@
 use std::array;
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, Parameter, ParameterError, ResetParameters, StatePart,
+    Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, place, shape};
+use crate::ids::{levels, shape};
 use crate::pictures::{self, PICTURE};
 
-const IDS: [&str; 3] = ids!("Battleship");
-const SIZES: [usize; 3] = [8, 10, 12];
-const SHIPS: [i64; 4] = [2, 3, 3, 4];
-/// Squares that ships cover.
-const COVERED: i32 = 12;
+const ARGUMENTS: &[Parameter] = &[
+    Parameter::int("board_size", 10, 1, ROWS as i64, "rows and columns of the board"),
+    Parameter::list("ship_sizes", &[2, 3, 3, 4], 1, ROWS as i64, "squares of each ship"),
+];
 /// The largest board's size.
-const ROWS: usize = 12;
+const ROWS: usize = 20;
+/// Most ships, of which each one more multiplies the time of [`are_ships`].
+const SHIPS: usize = 8;
 
-/// The board's size, and the rewards.
+/// The board's size, the ships, the squares that they cover, and the rewards.
 pub struct Parameters {
     size: usize,
+    ships: Vec<i64>,
+    covered: i32,
     hit: f64,
     miss: f64,
 }
@@ -30,8 +34,8 @@ pub struct Parameters {
 /// The state of an episode. The bits of a row are its columns.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Battleship {
-    ships: [u16; ROWS],
-    shots: [u16; ROWS],
+    ships: [u32; ROWS],
+    shots: [u32; ROWS],
     hits: i32,
     steps: i32,
     is_hit: bool,
@@ -50,7 +54,7 @@ impl Battleship {
             }
             let (top, bottom) = (start[0].min(end[0]) as usize, start[0].max(end[0]) as usize);
             let (left, right) = (start[1].min(end[1]), start[1].max(end[1]));
-            let columns = ((1_u16 << (right - left + 1)) - 1) << left;
+            let columns = ((1_u32 << (right - left + 1)) - 1) << left;
             if self.ships[top..=bottom].iter().all(|row| row & columns == 0) {
                 self.ships[top..=bottom].iter_mut().for_each(|row| *row |= columns);
                 return;
@@ -59,18 +63,49 @@ impl Battleship {
     }
 }
 
+/// Whether there is room for each ship wherever those before it are, so that drawing places comes to an end.
+fn has_room(size: i64, ships: &[i64]) -> bool {
+    let is_large = ships.iter().enumerate().all(|(number, ship)| {
+        // Places side by side in a row or column. Another ship takes one in each row that it crosses, and those that it lies on.
+        let places = size / ship;
+        let taken = ships[..number].iter().map(|other| other + places.min((other - 2).div_euclid(*ship) + 2));
+        taken.sum::<i64>() < 2 * size * places
+    });
+    is_large || size <= 8 && !can_block(size, 0, ships, &mut 200_000)
+}
+
+/// Whether ships that are placed one after the other can leave no place for the next. If `work` is used up, they may.
+fn can_block(size: i64, taken: u64, ships: &[i64], work: &mut u32) -> bool {
+    let Some((ship, rest)) = ships.split_first() else { return false };
+    *work = work.saturating_sub(1);
+    let lines = [1, size].into_iter().flat_map(|step| (0..size * size).map(move |start| (step, start)));
+    let places = lines.filter_map(|(step, start)| {
+        let from_edge = if step == 1 { start % size } else { start / size };
+        let squares =
+            (0..*ship).fold(0, |squares, at| squares | 1_u64.checked_shl((start + at * step) as u32).unwrap_or(0));
+        (from_edge + ship <= size && squares & taken == 0).then_some(squares)
+    });
+    let mut places = places.peekable();
+    *work == 0 || places.peek().is_none() || places.any(|place| can_block(size, taken | place, rest, work))
+}
+
 /// Whether these ships, side by side, can cover exactly these squares.
-fn are_ships(squares: [u16; ROWS], ships: &[i64]) -> bool {
+fn are_ships(squares: [u32; ROWS], ships: &[i64]) -> bool {
     let Some(row) = squares.iter().position(|bits| *bits != 0) else { return ships.is_empty() };
     // Some ship has its top or left end at the first square.
     let column = squares[row].trailing_zeros();
     ships.iter().enumerate().any(|(number, ship)| {
         let others = [&ships[..number], &ships[number + 1..]].concat();
-        [(1, *ship), (*ship, 1)].into_iter().any(|(height, width)| {
-            let (columns, mut rest) = (((1_u16 << width) - 1) << column, squares);
-            let covered = rest.iter_mut().skip(row).take(height as usize).filter(|bits| **bits & columns == columns);
-            covered.map(|bits| *bits &= !columns).count() == height as usize && are_ships(rest, &others)
-        })
+        !ships[..number].contains(ship)
+            && [(1, *ship), (*ship, 1)].into_iter().any(|(height, width)| {
+                let (columns, mut rest) = (((1_u64 << width) - 1) << column, squares);
+                let covered = rest
+                    .iter_mut()
+                    .skip(row)
+                    .take(height as usize)
+                    .filter(|bits| u64::from(**bits) & columns == columns);
+                covered.map(|bits| *bits &= !columns as u32).count() == height as usize && are_ships(rest, &others)
+            })
     })
 }
 
@@ -78,42 +113,50 @@ impl Task for Battleship {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
+        const FEATURES: &[Column] = &[Column { name: "hit", description: "1 if the last shot hit, otherwise 0" }];
+        let summary = "Find hidden ships; a shot only says whether it hit";
+        EnvSpec {
+            features: FEATURES,
+            needs_previous_action: true,
+            observation_space: Some(ObservationSpace::Discrete(2)),
+            arguments: ARGUMENTS,
+            picture: Some(PICTURE),
+            ..EnvSpec::new("Battleship", summary, ActionSpace::Discrete(1))
+        }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        const FEATURES: &[Column] = &[Column { name: "hit", description: "1 if the last shot hit, otherwise 0" }];
-        let spec = |(id, size): (_, usize)| {
-            let summary = "Find hidden ships; a shot only says whether it hit";
-            let actions = ActionSpace::MultiDiscrete(vec![size as i32; 2].into());
-            let board = shape(&[size, size]);
-            let state = vec![
-                StatePart::integers("ships", 2, board, "int8", "1 where a ship is"),
-                StatePart::integers("shots", 2, board, "int8", "1 where the agent has shot"),
-                StatePart::integer("hit", 2, "1 if the last shot hit, otherwise 0"),
-            ];
-            EnvSpec {
-                features: FEATURES,
-                markov_state: state.leak(),
-                needs_previous_action: true,
-                observation_space: Some(ObservationSpace::Discrete(2)),
-                picture: Some(PICTURE),
-                ..EnvSpec::new(id, summary, actions)
-            }
-        };
-        IDS.into_iter().zip(SIZES).map(spec).collect()
+        levels::<Self>(Self::spec(), ["board_size=8", "", "board_size=12"])
+    }
+
+    fn with_arguments(spec: EnvSpec, parameters: &Parameters) -> Result<EnvSpec, ParameterError> {
+        let Parameters { size, ships, covered, .. } = parameters;
+        let squares = (size * size) as i32;
+        if ships.len() > SHIPS || *covered >= squares || !has_room(*size as i64, ships) {
+            let allowed = format!("at most {SHIPS} ships that always fit on a board of {size}×{size} squares");
+            return Err(ParameterError::Argument { name: "ship_sizes", value: format!("{ships:?}"), allowed });
+        }
+        let board = shape(&[*size; 2]);
+        let state = vec![
+            StatePart::integers("ships", 2, board, "int8", "1 where a ship is"),
+            StatePart::integers("shots", 2, board, "int8", "1 where the agent has shot"),
+            StatePart::integer("hit", 2, "1 if the last shot hit, otherwise 0"),
+        ];
+        let action_space = ActionSpace::MultiDiscrete(vec![*size as i32; 2].into());
+        Ok(EnvSpec { action_space, markov_state: state.leak(), ..spec })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let size = SIZES[place(&IDS, given.id())];
-        let misses = (size * size) as i32 - COVERED;
-        Parameters { size, hit: 1.0 / f64::from(COVERED), miss: -1.0 / f64::from(misses) }
+        let (size, ships) = (given.int("board_size", 1) as usize, given.int_list("ship_sizes"));
+        let covered = ships.iter().sum::<i64>() as i32;
+        let misses = (size * size) as i32 - covered;
+        Parameters { size, ships, covered, hit: 1.0 / f64::from(covered), miss: -1.0 / f64::from(misses) }
     }
 
     fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
         *self = Battleship::default();
-        for ship in SHIPS {
-            self.place_ship(parameters.size as i64, ship, random);
+        for ship in &parameters.ships {
+            self.place_ship(parameters.size as i64, *ship, random);
         }
     }
 
@@ -125,7 +168,7 @@ impl Task for Battleship {
         self.steps = self.steps.saturating_add(1);
         Transition {
             reward: if self.is_hit { parameters.hit } else { parameters.miss },
-            terminated: self.hits == COVERED,
+            terminated: self.hits == parameters.covered,
             truncated: self.steps as usize >= parameters.size * parameters.size,
         }
     }
@@ -139,7 +182,7 @@ impl Task for Battleship {
         let rows = boards.iter().flat_map(|board| &board[..parameters.size]);
         let squares = rows.flat_map(|row| (0..parameters.size).map(move |column| row >> column & 1));
         let last = squares.chain([self.is_hit.into()]);
-        out.iter_mut().zip(last).for_each(|(out, bit)| *out = bit.into());
+        out.iter_mut().zip(last).for_each(|(out, bit)| *out = bit as f32);
     }
 
     /// Fire after a hit, rings in the water otherwise.
@@ -154,12 +197,12 @@ impl Task for Battleship {
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
-        let count = |rows: &[u16; ROWS]| rows.iter().map(|row| row.count_ones() as i32).sum::<i32>();
+        let count = |rows: &[u32; ROWS]| rows.iter().map(|row| row.count_ones() as i32).sum::<i32>();
         let (hits, shots) = (array::from_fn(|row| self.ships[row] & self.shots[row]), count(&self.shots));
         let is_on_board =
-            |(row, bits): (usize, &u16)| row < parameters.size && bits >> parameters.size == 0 || *bits == 0;
+            |(row, bits): (usize, &u32)| row < parameters.size && bits >> parameters.size == 0 || *bits == 0;
         [self.ships, self.shots].iter().all(|board| board.iter().enumerate().all(is_on_board))
-            && are_ships(self.ships, &SHIPS)
+            && are_ships(self.ships, &parameters.ships)
             && self.hits == count(&hits)
             && shots <= self.steps
             && (shots == 0) == (self.steps == 0)
@@ -167,15 +210,16 @@ impl Task for Battleship {
             && if self.is_hit { self.hits > 0 } else { self.steps == 0 || self.hits < self.steps }
     }
 
-    fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        let size = SIZES[place(&IDS, id)];
-        Some(Box::new(Hunter { size, shots: vec![None; size * size], last: None }))
+    fn expert(Parameters { size, ships, .. }: &Parameters) -> Option<Box<dyn Expert>> {
+        let ships = ships.iter().map(|ship| *ship as usize).collect();
+        Some(Box::new(Hunter { size: *size, ships, shots: vec![None; size * size], last: None }))
     }
 }
 
 /// Shoots where most placements of the ships fit its shots. Each hit that a placement covers makes it [`Hunter::HIT`] times as likely.
 struct Hunter {
     size: usize,
+    ships: Vec<usize>,
     /// Whether the shot at each square hit.
     shots: Vec<Option<bool>>,
     last: Option<usize>,
@@ -204,8 +248,8 @@ impl Expert for Hunter {
             self.shots[last] = Some(features[0] == 1.0);
         }
         let mut scores = vec![0.0; self.shots.len()];
-        for (start, ship) in (0..self.shots.len()).flat_map(|start| SHIPS.map(|ship| (start, ship as usize))) {
-            for squares in [false, true].into_iter().filter_map(|is_vertical| self.placement(start, ship, is_vertical))
+        for (start, ship) in (0..self.shots.len()).flat_map(|start| self.ships.iter().map(move |ship| (start, ship))) {
+            for squares in [false, true].into_iter().filter_map(|is_vertical| self.placement(start, *ship, is_vertical))
             {
                 let hits = squares.iter().filter(|square| self.shots[**square].is_some()).count();
                 squares.iter().for_each(|square| scores[*square] += Self::HIT.powi(hits as i32));

@@ -10,15 +10,16 @@ use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::filter::Filter;
-use crate::ids::{ids, place};
+use crate::filter::{Filter, MAX_LENGTH, NOISE, noise, variance};
+use crate::ids::levels;
 use crate::pictures::{self, PICTURE};
 
-const IDS: [[&str; 3]; 3] =
-    [ids!("PositionOnlyCartPole"), ids!("VelocityOnlyCartpole"), ids!("NoisyPositionOnlyCartPole")];
-const LENGTHS: [u32; 3] = [200, 400, 600];
-const DEVIATIONS: [f64; 3] = [0.1, 0.2, 0.3];
-
+/// The last is only for noisy ones.
+const ARGUMENTS: &[Parameter] = &[
+    Parameter::bool("sutton_barto_reward", false, "the reward is -1 until the pole falls, as the original maps it"),
+    MAX_LENGTH,
+    NOISE,
+];
 const PARAMETERS: &[Parameter] = &[
     Parameter::float(
         "low",
@@ -54,7 +55,8 @@ pub struct Parameters {
     /// Standard deviation of the noise.
     noise: Option<f64>,
     length: u32,
-    reward: f64,
+    /// The rewards of a step in which nothing fails, of the first that fails, and of later ones, after the end.
+    rewards: [f64; 3],
     low: f64,
     high: f64,
 }
@@ -102,10 +104,6 @@ impl Task for CartPole {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
-    }
-
-    fn specs() -> Vec<EnvSpec> {
         const ACTIONS: &[ActionBranch] = &[ActionBranch {
             name: "push",
             choices: &[
@@ -117,16 +115,6 @@ impl Task for CartPole {
             Column { name: "position", description: "position of the cart, m" },
             Column { name: "angle", description: "angle of the pole, rad" },
         ];
-        const VELOCITIES: &[Column] = &[
-            Column { name: "velocity", description: "velocity of the cart, m/s; at first its position, m" },
-            Column {
-                name: "angular_velocity",
-                description: "angular velocity of the pole, rad/s; at first its angle, rad",
-            },
-        ];
-        const BOUNDED: ObservationSpace = ObservationSpace::Box { low: &[-HIGH[0], -HIGH[1]], high: &HIGH };
-        const UNBOUNDED: ObservationSpace =
-            ObservationSpace::Box { low: &[f32::NEG_INFINITY; 2], high: &[f32::INFINITY; 2] };
         const STATE: &[StatePart] = &[StatePart {
             name: "motion",
             description: "position of the cart, m, its velocity, m/s, angle of the pole, rad, its angular velocity, rad/s",
@@ -137,35 +125,58 @@ impl Task for CartPole {
             shape: &[4],
             dtype: "float32",
         }];
-        let families = [
-            ("Balance a pole, seeing only positions", POSITIONS, BOUNDED),
-            ("Balance a pole, seeing only velocities", VELOCITIES, UNBOUNDED),
-            ("Balance a pole, seeing only positions, with noise", POSITIONS, BOUNDED),
+        let summary = "Balance a pole, seeing only positions";
+        EnvSpec {
+            actions: ACTIONS,
+            features: POSITIONS,
+            observation_space: Some(ObservationSpace::Box { low: &[-HIGH[0], -HIGH[1]], high: &HIGH }),
+            markov_state: STATE,
+            parameters: PARAMETERS,
+            arguments: &ARGUMENTS[..2],
+            render_fps: 50,
+            picture: Some(PICTURE),
+            ..EnvSpec::new("PositionOnlyCartPole", summary, ActionSpace::Discrete(2))
+        }
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        const VELOCITIES: &[Column] = &[
+            Column { name: "velocity", description: "velocity of the cart, m/s; at first its position, m" },
+            Column {
+                name: "angular_velocity",
+                description: "angular velocity of the pole, rad/s; at first its angle, rad",
+            },
         ];
-        let specs = IDS.into_iter().zip(families).flat_map(|(ids, (summary, features, space))| {
-            ids.map(|id| EnvSpec {
-                actions: ACTIONS,
-                features,
-                observation_space: Some(space),
-                markov_state: STATE,
-                parameters: PARAMETERS,
-                render_fps: 50,
-                picture: Some(PICTURE),
-                ..EnvSpec::new(id, summary, ActionSpace::Discrete(2))
-            })
-        });
-        specs.collect()
+        let (positions, lengths) = (Self::spec(), ["", "max_episode_length=400", "max_episode_length=600"]);
+        let unbounded = ObservationSpace::Box { low: &[f32::NEG_INFINITY; 2], high: &[f32::INFINITY; 2] };
+        let velocities = EnvSpec {
+            id: "VelocityOnlyCartpole",
+            summary: "Balance a pole, seeing only velocities",
+            features: VELOCITIES,
+            observation_space: Some(unbounded),
+            ..positions.clone()
+        };
+        let noisy = EnvSpec {
+            id: "NoisyPositionOnlyCartPole",
+            summary: "Balance a pole, seeing only positions, with noise",
+            arguments: ARGUMENTS,
+            ..positions.clone()
+        };
+        let noises = ["", "noise_sigma=0.2", "noise_sigma=0.3"];
+        [(positions, lengths), (velocities, lengths), (noisy, noises)]
+            .map(|(spec, each)| levels::<Self>(spec, each))
+            .concat()
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let at = place(&IDS.concat(), given.id());
-        let (family, level) = (at / 3, at % 3);
-        let length = if family == 2 { LENGTHS[0] } else { LENGTHS[level] };
+        let length = given.int(MAX_LENGTH.name, 1) as u32;
+        let good = 1.0 / f64::from(length);
+        let rewards = if given.bool("sutton_barto_reward", false) { [-1.0, good, good] } else { [good, good, -1.0] };
         Parameters {
-            velocities: family == 1,
-            noise: (family == 2).then_some(DEVIATIONS[level]),
+            velocities: given.id().contains("Velocity"),
+            noise: noise(given),
             length,
-            reward: 1.0 / f64::from(length),
+            rewards,
             low: given.float("low", -0.05),
             high: given.float("high", 0.05),
         }
@@ -182,7 +193,7 @@ impl Task for CartPole {
         self.push(action[0]);
         let fails = self.x < -MAX_X || self.x > MAX_X || self.angle < -MAX_ANGLE || self.angle > MAX_ANGLE;
         // Only steps after the end fail twice.
-        let reward = if fails && self.has_failed { -1.0 } else { parameters.reward };
+        let reward = parameters.rewards[usize::from(fails) + usize::from(fails && self.has_failed)];
         self.has_failed |= fails;
         self.steps = self.steps.saturating_add(1);
         let observed =
@@ -233,11 +244,10 @@ impl Task for CartPole {
             }
     }
 
-    fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        let at = place(&IDS.concat(), id);
+    fn expert(parameters: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Balance {
-            sees_velocities: at / 3 == 1,
-            variance: if at / 3 == 2 { DEVIATIONS[at % 3].powi(2) } else { 1e-12 },
+            sees_velocities: parameters.velocities,
+            variance: variance(parameters.noise),
             estimate: CartPole::default(),
             filters: [Filter::new(0.0, 0.0); 2],
             last: None,

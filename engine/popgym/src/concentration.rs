@@ -1,18 +1,19 @@
 //! Concentration: turn over two cards at a time, and find the pairs.
 
 use endless_gym_core::envs::{
-    ActionSpace, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, StateSpace, Task, Transition,
+    ActionSpace, EnvSpec, Expert, ObservationSpace, Parameter, ParameterError, ResetParameters, StatePart, StateSpace,
+    Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{DECK, Deck, Face};
-use crate::ids::{INTEGER_ZERO, ids, numbered, place, shape};
+use crate::deck::{DECK, DECKS, Deck, Face, decks};
+use crate::ids::{INTEGER_ZERO, levels, numbered, shape};
 use crate::pictures::{self, PICTURE};
 
-const IDS: [&str; 3] = ids!("Concentration");
-const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Colour), (1, Face::Rank)];
+const ARGUMENTS: &[Parameter] =
+    &[DECKS, Parameter::choice("deck_type", "ranks", &["colors", "ranks"], "what makes two cards a pair")];
 
 /// Number of decks, what makes a pair, the length of an episode, and the rewards.
 pub struct Parameters {
@@ -29,33 +30,33 @@ pub struct Concentration {
     deck: Deck,
     /// What the observation shows of each card.
     view: Vec<u8>,
-    /// Cards of found pairs, as bits.
-    found: u128,
+    /// Whether each card's pair was found.
+    found: Vec<bool>,
     /// The card that waits for a second one.
-    first: Option<u8>,
+    first: Option<u16>,
     /// The one or two cards that the last step showed.
-    shown: [u8; 2],
+    shown: [u16; 2],
     steps: u32,
 }
 
 impl Concentration {
-    fn is_found(&self, card: u8) -> bool {
-        self.found >> card & 1 == 1
+    fn is_found(&self, card: u16) -> bool {
+        self.found[usize::from(card)]
     }
 
-    fn face(&self, card: u8) -> u8 {
+    fn face(&self, card: u16) -> u8 {
         self.deck.cards()[usize::from(card)]
     }
 
     /// What the observation shows of a card.
-    fn shows(&self, card: u8, face: Face) -> u8 {
+    fn shows(&self, card: u16, face: Face) -> u8 {
         let is_shown = self.is_found(card) || self.steps > 0 && self.shown.contains(&card);
         if is_shown { self.face(card) } else { face.count() as u8 }
     }
 
     /// Whether the cards that were found are pairs, and those that are shown follow from the last actions.
     fn are_pairs(&self, face: Face) -> bool {
-        let found = |of| (0..self.view.len() as u8).filter(move |card| self.is_found(*card) && self.face(*card) == of);
+        let found = |of| (0..self.view.len() as u16).filter(move |card| self.is_found(*card) && self.face(*card) == of);
         let ([first, second], is_found) = (self.shown, self.shown.map(|card| self.is_found(card)));
         let is_pair = first != second && self.face(first) == self.face(second);
         (0..face.count() as u8).all(|of| found(of).count() % 2 == 0)
@@ -72,48 +73,52 @@ impl Task for Concentration {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
+        let summary = "Turn over two cards at a time, and find the pairs";
+        EnvSpec {
+            needs_previous_action: true,
+            types: INTEGER_ZERO,
+            arguments: ARGUMENTS,
+            picture: Some(PICTURE),
+            ..EnvSpec::new("Concentration", summary, ActionSpace::Discrete(1))
+        }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        let spec = |(id, (decks, face)): (_, (usize, Face))| {
-            let description = match face {
-                Face::Colour => "the card's colour, 0 or 1; 2 if it is face down",
-                _ => "the card's rank, 0 to 12; 13 if it is face down",
-            };
-            let cards = decks * DECK;
-            let summary = "Turn over two cards at a time, and find the pairs";
-            let faces = vec![face.count() as i32 + 1; cards].leak();
-            let features = numbered("card", cards, description);
-            let deck = shape(&[cards]);
-            let turned = "a card that the last step showed; without one the number of faces";
-            let state = vec![
-                StatePart::integers("faces", face.count() as i32, deck, "int64", "the cards' colours or ranks"),
-                StatePart {
-                    name: "found",
-                    description: "1 for cards of found pairs",
-                    space: StateSpace::Binary,
-                    shape: deck,
-                    dtype: "int8",
-                },
-                StatePart::integer("first", cards as i32, turned),
-                StatePart::integer("second", cards as i32, turned),
-            ];
-            EnvSpec {
-                features,
-                markov_state: state.leak(),
-                needs_previous_action: true,
-                types: INTEGER_ZERO,
-                observation_space: Some(ObservationSpace::MultiDiscrete(faces)),
-                picture: Some(PICTURE),
-                ..EnvSpec::new(id, summary, ActionSpace::Discrete(cards as i32))
-            }
+        levels::<Self>(Self::spec(), ["deck_type=colors", "num_decks=2&deck_type=colors", ""])
+    }
+
+    fn with_arguments(spec: EnvSpec, &Parameters { decks, face, .. }: &Parameters) -> Result<EnvSpec, ParameterError> {
+        let description = match face {
+            Face::Colour => "the card's colour, 0 or 1; 2 if it is face down",
+            _ => "the card's rank, 0 to 12; 13 if it is face down",
         };
-        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+        let cards = decks * DECK;
+        let faces = vec![face.count() as i32 + 1; cards].leak();
+        let deck = shape(&[cards]);
+        let turned = "a card that the last step showed; without one the number of faces";
+        let state = vec![
+            StatePart::integers("faces", face.count() as i32, deck, "int64", "the cards' colours or ranks"),
+            StatePart {
+                name: "found",
+                description: "1 for cards of found pairs",
+                space: StateSpace::Binary,
+                shape: deck,
+                dtype: "int8",
+            },
+            StatePart::integer("first", cards as i32, turned),
+            StatePart::integer("second", cards as i32, turned),
+        ];
+        Ok(EnvSpec {
+            action_space: ActionSpace::Discrete(cards as i32),
+            features: numbered("card", cards, description),
+            markov_state: state.leak(),
+            observation_space: Some(ObservationSpace::MultiDiscrete(faces)),
+            ..spec
+        })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let (decks, face) = VARIANTS[place(&IDS, given.id())];
+        let (decks, face) = (decks(given), Face::chosen(given));
         let cards = (decks * DECK) as f64;
         let length = (2.0 * cards - cards / (2.0 * cards - 1.0)).ceil();
         Parameters { decks, face, length: length as u32, pair: 1.0 / (cards / 2.0), failure: -1.0 / length }
@@ -123,11 +128,13 @@ impl Task for Concentration {
         self.deck.shuffle(parameters.decks, parameters.face, random);
         self.view.clear();
         self.view.resize(self.deck.cards().len(), parameters.face.count() as u8);
-        (self.found, self.first, self.shown, self.steps) = (0, None, [0; 2], 0);
+        self.found.clear();
+        self.found.resize(self.deck.cards().len(), false);
+        (self.first, self.shown, self.steps) = (None, [0; 2], 0);
     }
 
     fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
-        let card = action[0] as u8;
+        let card = action[0] as u16;
         let first = self.first.take();
         for card in self.shown {
             if !self.is_found(card) {
@@ -147,10 +154,10 @@ impl Task for Concentration {
             Some(first) => {
                 let is_pair = self.view[usize::from(first)] == self.view[usize::from(card)];
                 if is_pair && !is_found && first != card {
-                    self.found |= 1 << first | 1 << card;
+                    [first, card].iter().for_each(|card| self.found[usize::from(*card)] = true);
                     reward = parameters.pair;
                     // As in the original, a step after the end is not another end.
-                    terminated = self.found.count_ones() as usize == self.deck.cards().len();
+                    terminated = !self.found.contains(&false);
                 } else {
                     reward = 2.0 * parameters.failure;
                 }
@@ -170,9 +177,9 @@ impl Task for Concentration {
         let (faces, rest) = out.split_at_mut(cards.len());
         let (found, turned) = rest.split_at_mut(cards.len());
         faces.iter_mut().zip(cards).for_each(|(out, card)| *out = (*card).into());
-        found.iter_mut().zip(0..).for_each(|(out, card)| *out = self.is_found(card).into());
+        found.iter_mut().zip(&self.found).for_each(|(out, found)| *out = (*found).into());
         let [first, second] = self.shown;
-        let none = parameters.face.count() as u8;
+        let none = parameters.face.count() as u16;
         let shown = match self.first {
             None if self.steps == 0 => [none; 2],
             // A card of a found pair ends its turn at once.
@@ -184,8 +191,9 @@ impl Task for Concentration {
 
     fn paint(&self, parameters: &Parameters, canvas: &mut Canvas<'_>) {
         pictures::table(canvas);
-        let columns = if parameters.decks == 1 { 8 } else { 12 };
-        let (width, height) = (84 / columns, if parameters.decks == 1 { 12 } else { 9 });
+        // Cards of more than two decks are small, and lie on each other.
+        let (columns, height) = [(8, 12), (12, 9)].get(parameters.decks - 1).copied().unwrap_or((20, 4));
+        let width = 84 / columns;
         for (number, shown) in (0..).zip(&self.view) {
             let place = Rect::new(number % columns * width + 1, number / columns * height + 1, width - 1, height - 1);
             match usize::from(*shown) < parameters.face.count() {
@@ -198,14 +206,14 @@ impl Task for Concentration {
     fn is_valid(&self, parameters: &Parameters) -> bool {
         let cards = parameters.decks * DECK;
         self.deck.is_valid(parameters.decks, parameters.face, None)
-            && self.found >> cards == 0
-            && self.found.count_ones() <= self.steps
+            && self.found.len() == cards
+            && self.found.iter().filter(|found| **found).count() <= self.steps as usize
             && self.shown.into_iter().all(|card| usize::from(card) < cards)
-            && self.view.iter().copied().eq((0..cards as u8).map(|card| self.shows(card, parameters.face)))
+            && self.view.iter().copied().eq((0..cards as u16).map(|card| self.shows(card, parameters.face)))
             && self.are_pairs(parameters.face)
     }
 
-    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+    fn expert(_: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Memory::default()))
     }
 }

@@ -1,18 +1,22 @@
 //! Count Recall: count the cards of each kind, and say how many of the queried kind there have been.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, Parameter, ParameterError, ResetParameters, StatePart,
+    Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{DECK, Deck, Face};
-use crate::ids::{ids, numbered, place, shape};
+use crate::deck::{DECK, DECKS, Deck, Face, decks};
+use crate::ids::{levels, numbered, shape};
 use crate::pictures::{self, PICTURE};
 
-const IDS: [&str; 3] = ids!("CountRecall");
-const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Suit), (4, Face::Rank)];
+const ARGUMENTS: &[Parameter] = &[
+    DECKS,
+    Parameter::float("error_clamp", 0.5, -1e9, 1e9, "without effect, as in the original"),
+    Parameter::choice("deck_type", "colors", &["colors", "suits", "ranks"], "what tells cards apart"),
+];
 /// Most kinds of cards.
 const KINDS: usize = 13;
 
@@ -28,7 +32,7 @@ pub struct Parameters {
 pub struct CountRecall {
     cards: Deck,
     queries: Deck,
-    counts: [u8; KINDS],
+    counts: [u16; KINDS],
     card: u8,
     query: u8,
 }
@@ -57,47 +61,43 @@ impl Task for CountRecall {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
-    }
-
-    fn specs() -> Vec<EnvSpec> {
         const FEATURES: &[Column] = &[
             Column { name: "card", description: "the kind of the card: colour, suit or rank, from 0" },
             Column { name: "query", description: "the kind whose count is asked" },
         ];
-        let spec = |(id, (decks, face)): (_, (usize, Face))| {
-            let summary = "Count the cards of each kind, and say how many of the queried kind there have been";
-            let most = decks * DECK / face.count();
-            let ground_truth = numbered("counts", face.count(), "number of cards of the kind so far");
-            let kinds = vec![face.count() as i32; 2].leak();
-            let actions = ActionSpace::Discrete(most as i32 + 1);
-            let each = shape(&[face.count()]);
-            let state = vec![
-                StatePart::shares("dealt", each, "share of the cards of each kind that has been dealt"),
-                StatePart::shares("queried", each, "share of the queries for each kind that has been asked"),
-                StatePart::integers(
-                    "shown",
-                    face.count() as i32,
-                    &[2],
-                    "int64",
-                    "the kinds of the card and of the query",
-                ),
-            ];
-            EnvSpec {
-                features: FEATURES,
-                markov_state: state.leak(),
-                observation_space: Some(ObservationSpace::MultiDiscrete(kinds)),
-                ground_truth,
-                ground_truth_is_integer: true,
-                picture: Some(PICTURE),
-                ..EnvSpec::new(id, summary, actions)
-            }
-        };
-        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+        let summary = "Count the cards of each kind, and say how many of the queried kind there have been";
+        EnvSpec {
+            features: FEATURES,
+            ground_truth_is_integer: true,
+            arguments: ARGUMENTS,
+            picture: Some(PICTURE),
+            ..EnvSpec::new("CountRecall", summary, ActionSpace::Discrete(1))
+        }
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        levels::<Self>(Self::spec(), ["", "num_decks=2&deck_type=suits", "num_decks=4&deck_type=ranks"])
+    }
+
+    fn with_arguments(spec: EnvSpec, &Parameters { decks, face, .. }: &Parameters) -> Result<EnvSpec, ParameterError> {
+        let (kinds, each) = (face.count() as i32, shape(&[face.count()]));
+        let shown = "the kinds of the card and of the query";
+        let state = vec![
+            StatePart::shares("dealt", each, "share of the cards of each kind that has been dealt"),
+            StatePart::shares("queried", each, "share of the queries for each kind that has been asked"),
+            StatePart::integers("shown", kinds, &[2], "int64", shown),
+        ];
+        Ok(EnvSpec {
+            action_space: ActionSpace::Discrete((decks * DECK) as i32 / kinds + 1),
+            markov_state: state.leak(),
+            observation_space: Some(ObservationSpace::MultiDiscrete(vec![kinds; 2].leak())),
+            ground_truth: numbered("counts", face.count(), "number of cards of the kind so far"),
+            ..spec
+        })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let (decks, face) = VARIANTS[place(&IDS, given.id())];
+        let (decks, face) = (decks(given), Face::chosen(given));
         Parameters { decks, face, reward: 1.0 / (decks * DECK - 1) as f64 }
     }
 
@@ -153,7 +153,7 @@ impl Task for CountRecall {
             && self.are_counted()
     }
 
-    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+    fn expert(_: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Counts::default()))
     }
 }

@@ -1,5 +1,6 @@
 //! Shuffled playing cards.
 
+use endless_gym_core::envs::{Parameter, ResetParameters};
 use endless_gym_core::random::Generator;
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +20,24 @@ pub enum Face {
 /// Cards in one deck.
 pub const DECK: usize = 52;
 
+/// The argument of the number of decks. The original counts the cards of a rank in a byte.
+pub const DECKS: Parameter = Parameter::int("num_decks", 1, 1, 63, "number of decks of 52 cards");
+
+/// The number of decks.
+pub fn decks(given: &ResetParameters) -> usize {
+    given.int(DECKS.name, 1) as usize
+}
+
 impl Face {
+    /// The face by which the argument `deck_type` tells cards apart.
+    pub fn chosen(given: &ResetParameters) -> Self {
+        match given.choice("deck_type") {
+            "colors" => Face::Colour,
+            "suits" => Face::Suit,
+            _ => Face::Rank,
+        }
+    }
+
     /// Number of different faces.
     pub const fn count(self) -> usize {
         match self {

@@ -1,4 +1,19 @@
-//! A Kalman filter for a position or an angle whose motion is known and whose observations are noisy.
+//! Motions whose observations are noisy: their arguments, and a Kalman filter for a position or an angle of a known motion.
+
+use endless_gym_core::envs::{Parameter, ResetParameters};
+
+pub const MAX_LENGTH: Parameter = Parameter::int("max_episode_length", 200, 1, i32::MAX as i64, "steps of an episode");
+pub const NOISE: Parameter = Parameter::float("noise_sigma", 0.1, 0.0, 1e6, "standard deviation of the noise");
+
+/// The standard deviation of the noise, if there is noise.
+pub fn noise(given: &ResetParameters) -> Option<f64> {
+    Some(given.float(NOISE.name, -1.0)).filter(|deviation| *deviation >= 0.0)
+}
+
+/// The variance of observations.
+pub fn variance(noise: Option<f64>) -> f64 {
+    noise.map_or(1e-12, |deviation| deviation.powi(2).max(1e-12))
+}
 
 /// The covariance of an estimated position and its velocity.
 #[derive(Clone, Copy, Debug)]

@@ -8,12 +8,10 @@ use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{DECK, Deck, Face};
-use crate::ids::{INTEGER_ZERO, ids, place};
+use crate::deck::{DECK, DECKS, Deck, Face, decks};
+use crate::ids::{INTEGER_ZERO, levels};
 use crate::pictures::{self, ALONE, PICTURE};
 
-const IDS: [&str; 3] = ids!("HigherLower");
-const DECKS: [usize; 3] = [1, 2, 3];
 const HIGHER: i32 = 0;
 const LOWER: i32 = 1;
 
@@ -62,17 +60,18 @@ impl Task for HigherLower {
             ground_truth_is_integer: true,
             markov_state: STATE,
             types: INTEGER_ZERO,
+            arguments: &[DECKS],
             picture: Some(PICTURE),
-            ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(2))
+            ..EnvSpec::new("HigherLower", summary, ActionSpace::Discrete(2))
         }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        IDS.map(|id| EnvSpec { id, ..Self::spec() }).into()
+        levels::<Self>(Self::spec(), ["", "num_decks=2", "num_decks=3"])
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let decks = DECKS[place(&IDS, given.id())];
+        let decks = decks(given);
         Parameters { decks, reward: 1.0 / (decks * DECK) as f64 }
     }
 
@@ -116,8 +115,8 @@ impl Task for HigherLower {
         self.deck.is_valid(parameters.decks, Face::Card, Some(self.card))
     }
 
-    fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        Some(Box::new(Counts { left: [0; 13], decks: DECKS[place(&IDS, id)] as i32 }))
+    fn expert(parameters: &Parameters) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Counts { left: [0; 13], decks: parameters.decks as i32 }))
     }
 }
 

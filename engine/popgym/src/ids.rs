@@ -1,22 +1,17 @@
 //! Names that several families share.
 
-use endless_gym_core::envs::{ActionBranch, Choice, Column, OriginalTypes, RewardType};
+use endless_gym_core::envs::{ActionBranch, Choice, Column, EnvSpec, OriginalTypes, ParameterError, RewardType, Task};
 
-/// The ids of a family: easy, medium, hard.
-macro_rules! ids {
-    ($name:literal) => {
-        [
-            concat!("popgym-", $name, "Easy-v0"),
-            concat!("popgym-", $name, "Medium-v0"),
-            concat!("popgym-", $name, "Hard-v0"),
-        ]
+/// The specifications of a family in its difficulties, which have these arguments. The id of `family` is the name of the original's class.
+pub fn levels<T: Task>(family: EnvSpec, arguments: [&str; 3]) -> Vec<EnvSpec> {
+    let level = |(level, arguments)| -> Result<EnvSpec, ParameterError> {
+        let id = format!("popgym-{}{level}-v0", family.id).leak();
+        let spec = EnvSpec { id, ..family.with_arguments(arguments)? };
+        let parameters = T::parameters(&spec.reset_parameters(&Default::default())?);
+        T::with_arguments(spec, &parameters)
     };
-}
-pub(crate) use ids;
-
-/// The place of an id in its family's table; 0 if it is not there.
-pub fn place(ids: &[&str], id: &str) -> usize {
-    ids.iter().position(|known| *known == id).unwrap_or_default()
+    let levels = ["Easy", "Medium", "Hard"].into_iter().zip(arguments).map(level);
+    levels.collect::<Result<_, _>>().expect("the arguments of the difficulties are valid")
 }
 
 /// Naming a suit.

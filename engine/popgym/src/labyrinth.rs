@@ -3,21 +3,21 @@
 use std::collections::HashSet;
 
 use endless_gym_core::envs::{
-    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, OriginalTypes, ResetParameters,
-    RewardType, StatePart, Task, Transition,
+    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, OriginalTypes, Parameter,
+    ParameterError, ParameterKind, ResetParameters, RewardType, StatePart, Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, numbered, place, shape};
+use crate::ids::{levels, numbered, shape};
 use crate::maze::{Maze, Place, connected};
 use crate::pictures::{self, PICTURE};
 
-const IDS: [[&str; 3]; 2] = [ids!("LabyrinthEscape"), ids!("LabyrinthExplore")];
-/// Cells from the left to the right, between walls.
-const CELLS: [usize; 3] = [5, 7, 9];
-const LENGTH: u32 = 1024;
+const ARGUMENTS: &[Parameter] = &[
+    Parameter::list("maze_dims", &[10, 10], 6, 62, "height and width of the maze, two even numbers"),
+    Parameter::int("episode_length", 1024, 1, i32::MAX as i64, "one more than the steps of an episode; 1 for no limit"),
+];
 /// Cells of the observation.
 const VIEW: usize = 9;
 /// The last action, before the first.
@@ -29,10 +29,12 @@ const START: f32 = 2.0;
 const GOAL: f32 = 3.0;
 const HIDDEN: f32 = 4.0;
 
-/// The maze's size and the agent's task.
+/// The maze's rows and columns of cells, between walls, the agent's task, the length of an episode, and the reward of a step.
 pub struct Parameters {
-    cells: usize,
+    cells: [usize; 2],
     escapes: bool,
+    length: u32,
+    step: f64,
 }
 
 /// The state of an episode.
@@ -41,7 +43,7 @@ pub struct Labyrinth {
     maze: Maze,
     position: Place,
     /// Squares that the agent has been on, as bits of rows.
-    explored: Vec<u32>,
+    explored: Vec<u64>,
     /// Squares that are no wall and have not been explored.
     left: u32,
     /// Reward for a new square.
@@ -54,12 +56,12 @@ impl Labyrinth {
     /// The square in a direction; the agent's own square if that is a wall or outside.
     fn moved(&self, action: i32, escapes: bool) -> Place {
         let Place { row, column } = self.position;
-        let last = self.maze.size() - 1;
+        let [rows, columns] = self.maze.size();
         let to = match action {
             0 => Place { row, column: column.saturating_sub(1) },
-            1 => Place { row, column: last.min(column + 1) },
+            1 => Place { row, column: (columns - 1).min(column + 1) },
             2 => Place { row: row.saturating_sub(1), column },
-            _ => Place { row: last.min(row + 1), column },
+            _ => Place { row: (rows - 1).min(row + 1), column },
         };
         if self.square(to, escapes) == WALL { self.position } else { to }
     }
@@ -97,7 +99,7 @@ impl Labyrinth {
             && self.explored.iter().zip(&ways).all(|(explored, ways)| explored & !ways == 0)
             && connected(&self.explored, self.maze.start) == self.explored
             && row < ways.len()
-            && column < ways.len()
+            && column < self.maze.size()[1]
             && self.explored[row] >> column & 1 == 1
             && explored <= self.steps.saturating_add(1)
             && self.left == (self.maze.free() + 1).saturating_sub(explored)
@@ -108,10 +110,6 @@ impl Task for Labyrinth {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
-    }
-
-    fn specs() -> Vec<EnvSpec> {
         const ACTIONS: &[ActionBranch] = &[ActionBranch {
             name: "move",
             choices: &[
@@ -129,37 +127,48 @@ impl Task for Labyrinth {
         let squares = "a square around the agent, row by row: 0 free, 1 wall, 2 start, 3 exit; at the left and the upper border, the \
                        view has only two columns or rows, followed by walls";
         let action = Column { name: "action", description: "the last action, 0 to 3; at first 4" };
-        let features = [numbered("square", VIEW, squares), &[action]].concat().leak();
-        let summaries = [
-            "Find the exit of a maze, seeing only the squares around",
-            "Explore a maze, seeing only the squares around",
-        ];
-        let states = CELLS.map(|cells| -> &[StatePart] {
-            let squares = "the maze, row by row: 0 free, 1 wall, 2 start, 3 exit; 4 where the agent has not been";
-            vec![StatePart::integers("maze", 5, shape(&[2 * cells + 1; 2]), "int8", squares)].leak()
-        });
-        let rewards = [RewardType::Float, RewardType::NumpyFloatIfPositive];
-        let specs = IDS.into_iter().zip(summaries).zip(rewards).flat_map(|((ids, summary), reward)| {
-            let features: &'static [Column] = features;
-            ids.into_iter().zip(states).map(move |(id, markov_state)| EnvSpec {
-                markov_state,
-                needs_previous_action: true,
-                types: OriginalTypes { integers: "int32", reward, ..OriginalTypes::default() },
-                actions: ACTIONS,
-                features,
-                observation_space: Some(SPACE),
-                ground_truth: GROUND_TRUTH,
-                ground_truth_is_integer: true,
-                picture: Some(PICTURE),
-                ..EnvSpec::new(id, summary, ActionSpace::Discrete(4))
-            })
-        });
-        specs.collect()
+        let summary = "Find the exit of a maze, seeing only the squares around";
+        EnvSpec {
+            needs_previous_action: true,
+            types: OriginalTypes { integers: "int32", ..OriginalTypes::default() },
+            actions: ACTIONS,
+            features: [numbered("square", VIEW, squares), &[action]].concat().leak(),
+            observation_space: Some(SPACE),
+            ground_truth: GROUND_TRUTH,
+            ground_truth_is_integer: true,
+            arguments: ARGUMENTS,
+            picture: Some(PICTURE),
+            ..EnvSpec::new("LabyrinthEscape", summary, ActionSpace::Discrete(4))
+        }
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        let escape = Self::spec();
+        let explore = EnvSpec {
+            id: "LabyrinthExplore",
+            summary: "Explore a maze, seeing only the squares around",
+            types: OriginalTypes { reward: RewardType::NumpyFloatIfPositive, ..escape.types },
+            ..escape.clone()
+        };
+        [escape, explore].map(|spec| levels::<Self>(spec, ["", "maze_dims=14,14", "maze_dims=18,18"])).concat()
+    }
+
+    fn with_arguments(spec: EnvSpec, parameters: &Parameters) -> Result<EnvSpec, ParameterError> {
+        if let ParameterKind::IntList { default, .. } = spec.arguments[0].kind
+            && (default.len() != 2 || default.iter().any(|size| size % 2 == 1))
+        {
+            let (value, allowed) = (format!("{default:?}"), "two even numbers, 6 to 62".to_owned());
+            return Err(ParameterError::Argument { name: "maze_dims", value, allowed });
+        }
+        let squares = "the maze, row by row: 0 free, 1 wall, 2 start, 3 exit; 4 where the agent has not been";
+        let size = shape(&parameters.cells.map(|cells| 2 * cells + 1));
+        Ok(EnvSpec { markov_state: vec![StatePart::integers("maze", 5, size, "int8", squares)].leak(), ..spec })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let at = place(&IDS.concat(), given.id());
-        Parameters { cells: CELLS[at % 3], escapes: at < 3 }
+        let (sizes, length) = (given.int_list("maze_dims"), given.int("episode_length", 1) as u32);
+        let cells = [0, 1].map(|axis| sizes.get(axis).map_or(3, |size| *size as usize / 2));
+        Parameters { cells, escapes: given.id().contains("Escape"), length, step: -1.0 / f64::from(length) }
     }
 
     fn seed(&mut self, seed: u64) {
@@ -170,7 +179,7 @@ impl Task for Labyrinth {
         self.maze.generate(parameters.cells, random);
         self.position = self.maze.start;
         self.explored.clear();
-        self.explored.resize(self.maze.size(), 0);
+        self.explored.resize(self.maze.size()[0], 0);
         let free = self.maze.free();
         self.reward = 1.0 / f64::from(free);
         self.left = free + 1;
@@ -183,7 +192,7 @@ impl Task for Labyrinth {
         let is_new = self.explore();
         self.action = action[0] as u8;
         self.steps = self.steps.saturating_add(1);
-        let (mut reward, mut terminated) = (-1.0 / f64::from(LENGTH), false);
+        let (mut reward, mut terminated) = (parameters.step, false);
         if parameters.escapes && self.position == self.maze.goal {
             reward += 1.0;
             terminated = true;
@@ -193,17 +202,19 @@ impl Task for Labyrinth {
             }
             terminated = self.left == 0;
         }
-        Transition { reward, terminated, truncated: self.steps == LENGTH - 1 }
+        Transition { reward, terminated, truncated: self.steps == parameters.length - 1 }
     }
 
     fn features(&self, parameters: &Parameters, out: &mut [f32]) {
         let Place { row, column } = self.position;
         let (top, left) = (row.saturating_sub(1), column.saturating_sub(1));
-        let size = self.maze.size();
+        let [rows, columns] = self.maze.size();
+        // The original confuses height and width here.
+        let (bottom, right) = (rows.min(columns.min(row + 1) + 1), columns.min(rows.min(column + 1) + 1));
         for (number, out) in out[..VIEW].iter_mut().enumerate() {
             let place = Place { row: top + number / 3, column: left + number % 3 };
-            let is_inside = place.row < size.min(row + 2) && place.column < size.min(column + 2);
-            *out = if is_inside { self.square(place, parameters.escapes) } else { WALL };
+            *out =
+                if place.row < bottom && place.column < right { self.square(place, parameters.escapes) } else { WALL };
         }
         out[VIEW] = self.action.into();
     }
@@ -234,9 +245,9 @@ impl Task for Labyrinth {
     }
 
     fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
-        let size = self.maze.size();
+        let [_, columns] = self.maze.size();
         for (number, out) in out.iter_mut().enumerate() {
-            let place = Place { row: number / size, column: number % size };
+            let place = Place { row: number / columns, column: number % columns };
             let is_explored = self.explored[place.row] >> place.column & 1 == 1;
             *out = if is_explored { self.square(place, parameters.escapes) } else { HIDDEN };
         }
@@ -249,7 +260,7 @@ impl Task for Labyrinth {
             && if self.steps == 0 { self.action == NONE } else { self.action < NONE }
     }
 
-    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+    fn expert(_: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Walker::default()))
     }
 }
@@ -333,11 +344,12 @@ mod tests {
 
     #[test]
     fn the_expert_walks_no_way_more_than_twice() {
-        for (number, id) in IDS.concat().into_iter().enumerate() {
-            let parameters = Parameters { cells: CELLS[number % 3], escapes: number < 3 };
+        for spec in Labyrinth::specs() {
+            let (id, parameters) =
+                (spec.id, Labyrinth::parameters(&spec.reset_parameters(&Default::default()).unwrap()));
             for seed in 0..50 {
                 let (mut labyrinth, mut random) = (Labyrinth::default(), Generator::from_seed(seed));
-                let mut expert = Labyrinth::expert(id).unwrap();
+                let mut expert = Labyrinth::expert(&parameters).unwrap();
                 labyrinth.seed(seed);
                 labyrinth.reset(&parameters, &mut random);
                 expert.reset();

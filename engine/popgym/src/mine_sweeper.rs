@@ -1,22 +1,23 @@
 //! Mine Sweeper: view all squares without a mine; a viewed square says how many mines are around it.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, Parameter, ParameterError, ResetParameters, StatePart,
+    Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, place, shape};
+use crate::ids::{levels, shape};
 use crate::pictures::{self, PICTURE};
 
-const IDS: [&str; 3] = ids!("MineSweeper");
-/// The board's size, and the number of mines.
-const VARIANTS: [(usize, usize); 3] = [(4, 2), (6, 6), (8, 10)];
+const DIFFICULTY: Parameter =
+    Parameter::choice("difficulty", "easy", &["easy", "medium", "hard"], "size of the board and number of mines");
 /// Most mines.
 const MINES: usize = 10;
 
 /// The board's size, and what follows from it.
+#[derive(Clone)]
 pub struct Parameters {
     size: usize,
     mines: usize,
@@ -26,26 +27,6 @@ pub struct Parameters {
     viewed: f64,
     mine: f64,
     known: f64,
-}
-
-impl Parameters {
-    fn new(id: &str) -> Self {
-        let (size, mines) = VARIANTS[place(&IDS, id)];
-        let squares = size * size;
-        let near = |a: usize, b: usize| (a / size).abs_diff(b / size) <= 1 && (a % size).abs_diff(b % size) <= 1;
-        let around = |of| (0..squares).filter(|square| near(of, *square)).fold(0, |bits, square| bits | 1 << square);
-        let max_steps = squares - mines;
-        let viewed = 1.0 / max_steps as f64;
-        Parameters {
-            size,
-            mines,
-            around: (0..squares).map(around).collect(),
-            max_steps: max_steps as u32,
-            viewed,
-            mine: -0.5 - viewed,
-            known: -0.5 / (max_steps - 2) as f64,
-        }
-    }
 }
 
 /// The state of an episode. Squares are bits, row by row.
@@ -62,30 +43,52 @@ impl Task for MineSweeper {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
+        const FEATURES: &[Column] = &[Column { name: "mines", description: "mines on and around the last square" }];
+        let summary = "View all squares without a mine; a viewed square says how many mines are around it";
+        EnvSpec {
+            features: FEATURES,
+            needs_previous_action: true,
+            arguments: &[DIFFICULTY],
+            picture: Some(PICTURE),
+            ..EnvSpec::new("MineSweeper", summary, ActionSpace::Discrete(1))
+        }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        const FEATURES: &[Column] = &[Column { name: "mines", description: "mines on and around the last square" }];
-        let spec = |(id, (size, mines)): (_, (usize, usize))| {
-            let summary = "View all squares without a mine; a viewed square says how many mines are around it";
-            let actions = ActionSpace::MultiDiscrete(vec![size as i32; 2].into());
-            let squares = "the squares, row by row: 0 not viewed, 1 a mine, 2 viewed";
-            let state = vec![StatePart::integers("board", 3, shape(&[size * size]), "int8", squares)];
-            EnvSpec {
-                features: FEATURES,
-                markov_state: state.leak(),
-                needs_previous_action: true,
-                observation_space: Some(ObservationSpace::Discrete(mines.min(9) as i32 + 1)),
-                picture: Some(PICTURE),
-                ..EnvSpec::new(id, summary, actions)
-            }
-        };
-        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+        levels::<Self>(Self::spec(), ["", "difficulty=medium", "difficulty=hard"])
+    }
+
+    fn with_arguments(spec: EnvSpec, &Parameters { size, mines, .. }: &Parameters) -> Result<EnvSpec, ParameterError> {
+        let squares = "the squares, row by row: 0 not viewed, 1 a mine, 2 viewed";
+        let state = vec![StatePart::integers("board", 3, shape(&[size * size]), "int8", squares)];
+        Ok(EnvSpec {
+            action_space: ActionSpace::MultiDiscrete(vec![size as i32; 2].into()),
+            markov_state: state.leak(),
+            observation_space: Some(ObservationSpace::Discrete(mines.min(9) as i32 + 1)),
+            ..spec
+        })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        Parameters::new(given.id())
+        let (size, mines) = match given.choice(DIFFICULTY.name) {
+            "easy" => (4, 2),
+            "medium" => (6, 6),
+            _ => (8, MINES),
+        };
+        let squares = size * size;
+        let near = |a: usize, b: usize| (a / size).abs_diff(b / size) <= 1 && (a % size).abs_diff(b % size) <= 1;
+        let around = |of| (0..squares).filter(|square| near(of, *square)).fold(0, |bits, square| bits | 1 << square);
+        let max_steps = squares - mines;
+        let viewed = 1.0 / max_steps as f64;
+        Parameters {
+            size,
+            mines,
+            around: (0..squares).map(around).collect(),
+            max_steps: max_steps as u32,
+            viewed,
+            mine: -0.5 - viewed,
+            known: -0.5 / (max_steps - 2) as f64,
+        }
     }
 
     fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
@@ -149,9 +152,9 @@ impl Task for MineSweeper {
             }
     }
 
-    fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        let parameters = Parameters::new(id);
-        Some(Box::new(Solver { counts: vec![None; parameters.around.len()], parameters, last: None }))
+    fn expert(parameters: &Parameters) -> Option<Box<dyn Expert>> {
+        let counts = vec![None; parameters.around.len()];
+        Some(Box::new(Solver { counts, parameters: parameters.clone(), last: None }))
     }
 }
 

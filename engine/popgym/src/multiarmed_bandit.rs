@@ -1,20 +1,20 @@
 //! Multiarmed Bandit: find the arms that pay best.
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, Parameter, ParameterError, ResetParameters, StatePart,
+    Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ids, numbered, place, shape};
+use crate::ids::{levels, numbered, shape};
 use crate::pictures::{self, PICTURE};
 
-const IDS: [&str; 3] = ids!("MultiarmedBandit");
-/// Arms, and the length of an episode.
-const VARIANTS: [(usize, u32); 3] = [(10, 200), (20, 400), (30, 600)];
-/// Most arms.
-const ARMS: usize = 30;
+const ARGUMENTS: &[Parameter] = &[
+    Parameter::int("num_bandits", 10, 1, 1000, "number of arms"),
+    Parameter::int("episode_length", 200, 1, i32::MAX as i64, "steps of an episode"),
+];
 
 /// Arms, the length of an episode, and the reward.
 pub struct Parameters {
@@ -27,7 +27,7 @@ pub struct Parameters {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct MultiarmedBandit {
     /// How likely each arm pays.
-    arms: [f32; ARMS],
+    arms: Vec<f32>,
     steps: u32,
     has_paid: bool,
 }
@@ -36,32 +36,41 @@ impl Task for MultiarmedBandit {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
+        const FEATURES: &[Column] = &[Column { name: "paid", description: "1 if the last arm paid, otherwise 0" }];
+        EnvSpec {
+            features: FEATURES,
+            needs_previous_action: true,
+            observation_space: Some(ObservationSpace::Discrete(2)),
+            arguments: ARGUMENTS,
+            picture: Some(PICTURE),
+            ..EnvSpec::new("MultiarmedBandit", "Find the arms that pay best", ActionSpace::Discrete(1))
+        }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        const FEATURES: &[Column] = &[Column { name: "paid", description: "1 if the last arm paid, otherwise 0" }];
-        let state = |arms| StatePart::shares("bandits", shape(&[arms]), "probability that each arm pays");
-        let spec = |(id, (arms, _)): (_, (usize, _))| EnvSpec {
-            features: FEATURES,
-            markov_state: vec![state(arms)].leak(),
-            needs_previous_action: true,
-            observation_space: Some(ObservationSpace::Discrete(2)),
+        let harder = ["num_bandits=20&episode_length=400", "num_bandits=30&episode_length=600"];
+        levels::<Self>(Self::spec(), ["", harder[0], harder[1]])
+    }
+
+    fn with_arguments(spec: EnvSpec, &Parameters { arms, .. }: &Parameters) -> Result<EnvSpec, ParameterError> {
+        let state = StatePart::shares("bandits", shape(&[arms]), "probability that each arm pays");
+        Ok(EnvSpec {
+            action_space: ActionSpace::Discrete(arms as i32),
+            markov_state: vec![state].leak(),
             ground_truth: numbered("bandits", arms, "probability that the arm pays"),
-            picture: Some(PICTURE),
-            ..EnvSpec::new(id, "Find the arms that pay best", ActionSpace::Discrete(arms as i32))
-        };
-        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+            ..spec
+        })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let (arms, length) = VARIANTS[place(&IDS, given.id())];
+        let (arms, length) = (given.int("num_bandits", 1) as usize, given.int("episode_length", 1) as u32);
         Parameters { arms, length, reward: 1.0 / f64::from(length) }
     }
 
     fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
-        *self = MultiarmedBandit::default();
-        self.arms[..parameters.arms].fill_with(|| random.random_f32());
+        self.arms.clear();
+        self.arms.resize_with(parameters.arms, || random.random_f32());
+        (self.steps, self.has_paid) = (0, false);
     }
 
     fn step(&mut self, parameters: &Parameters, action: &[i32], random: &mut Generator) -> Transition {
@@ -92,20 +101,19 @@ impl Task for MultiarmedBandit {
         }
     }
 
-    fn markov_state(&self, parameters: &Parameters, out: &mut [f32]) {
-        out.copy_from_slice(&self.arms[..parameters.arms]);
+    fn markov_state(&self, _: &Parameters, out: &mut [f32]) {
+        out.copy_from_slice(&self.arms);
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
-        let (arms, others) = self.arms.split_at(parameters.arms);
         // Multiples of 2⁻²⁴, as the generator draws them.
-        arms.iter().all(|arm| (0.0..1.0).contains(arm) && (arm * 2_f32.powi(24)).fract() == 0.0)
-            && others.iter().all(|arm| *arm == 0.0)
+        self.arms.iter().all(|arm| (0.0..1.0).contains(arm) && (arm * 2_f32.powi(24)).fract() == 0.0)
+            && self.arms.len() == parameters.arms
             && (self.steps > 0 || !self.has_paid)
     }
 
-    fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        Some(Box::new(Optimist { pulls: vec![[0.0; 2]; VARIANTS[place(&IDS, id)].0], last: None }))
+    fn expert(parameters: &Parameters) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Optimist { pulls: vec![[0.0; 2]; parameters.arms], last: None }))
     }
 }
 

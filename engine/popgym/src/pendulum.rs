@@ -11,14 +11,13 @@ use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
-use crate::filter::Filter;
-use crate::ids::{ids, place};
+use crate::filter::{Filter, MAX_LENGTH, NOISE, noise, variance};
+use crate::ids::levels;
 use crate::pictures::{self, PICTURE};
 
-const IDS: [[&str; 3]; 2] = [ids!("PositionOnlyPendulum"), ids!("NoisyPositionOnlyPendulum")];
-const LENGTHS: [u32; 3] = [200, 150, 100];
-const DEVIATIONS: [f64; 3] = [0.1, 0.2, 0.3];
-
+/// The last is only for noisy ones.
+const ARGUMENTS: &[Parameter] =
+    &[Parameter::float("g", 10.0, -1000.0, 1000.0, "acceleration by gravity, m/s²"), MAX_LENGTH, NOISE];
 const PARAMETERS: &[Parameter] = &[
     Parameter::float("x_init", PI, 0.0, 100.0, "Bound of the first angle, rad: it is drawn from -x_init to x_init."),
     Parameter::float("y_init", 1.0, 0.0, 8.0, "Bound of the first angular velocity, rad/s."),
@@ -28,8 +27,6 @@ const PARAMETERS: &[Parameter] = &[
 const MAX_SPEED: f64 = 8.0;
 const MAX_TORQUE: f32 = 2.0;
 const SECONDS: f64 = 0.05;
-/// Acceleration by gravity: 3 g / (2 l).
-const GRAVITY: f64 = 15.0;
 /// Acceleration by torque: 3 / (m l²).
 const TORQUE: f32 = 3.0;
 /// Half the range of Gymnasium's rewards, which POPGym maps to -1..1.
@@ -39,6 +36,8 @@ const HALF_RANGE: f64 = 16.2736044 / 2.0;
 pub struct Parameters {
     /// Standard deviation of the noise.
     noise: Option<f64>,
+    /// Acceleration by gravity: 3 g / (2 l).
+    gravity: f64,
     length: u32,
     x_init: f64,
     y_init: f64,
@@ -55,8 +54,8 @@ pub struct Pendulum {
 
 impl Pendulum {
     /// Moves on by one step. Every operation rounds as in Gymnasium.
-    fn swing(&mut self, torque: f32) {
-        let velocity = self.velocity + (GRAVITY * self.angle.sin() + f64::from(TORQUE * torque)) * SECONDS;
+    fn swing(&mut self, torque: f32, gravity: f64) {
+        let velocity = self.velocity + (gravity * self.angle.sin() + f64::from(TORQUE * torque)) * SECONDS;
         self.velocity = velocity.clamp(-MAX_SPEED, MAX_SPEED);
         self.angle += self.velocity * SECONDS;
     }
@@ -81,10 +80,6 @@ impl Task for Pendulum {
     type Parameters = Parameters;
 
     fn spec() -> EnvSpec {
-        Self::specs().swap_remove(0)
-    }
-
-    fn specs() -> Vec<EnvSpec> {
         const FEATURES: &[Column] = &[
             Column { name: "cos", description: "cosine of the angle from the upright position" },
             Column { name: "sin", description: "sine of the angle" },
@@ -97,29 +92,36 @@ impl Task for Pendulum {
             dtype: "float32",
         }];
         let types = OriginalTypes { reward: RewardType::NumpyFloat, ..OriginalTypes::default() };
-        let summaries =
-            ["Swing a pendulum up, seeing only its angle", "Swing a pendulum up, seeing only its angle, with noise"];
-        let specs = IDS.into_iter().zip(summaries).flat_map(|(ids, summary)| {
-            ids.map(|id| EnvSpec {
-                markov_state: STATE,
-                types,
-                features: FEATURES,
-                observation_space: Some(ObservationSpace::Box { low: &[-1.0; 2], high: &[1.0; 2] }),
-                parameters: PARAMETERS,
-                render_fps: 30,
-                picture: Some(PICTURE),
-                ..EnvSpec::new(id, summary, ActionSpace::bounded(&[-MAX_TORQUE], &[MAX_TORQUE]))
-            })
-        });
-        specs.collect()
+        let summary = "Swing a pendulum up, seeing only its angle";
+        EnvSpec {
+            markov_state: STATE,
+            types,
+            features: FEATURES,
+            observation_space: Some(ObservationSpace::Box { low: &[-1.0; 2], high: &[1.0; 2] }),
+            parameters: PARAMETERS,
+            arguments: &ARGUMENTS[..2],
+            render_fps: 30,
+            picture: Some(PICTURE),
+            ..EnvSpec::new("PositionOnlyPendulum", summary, ActionSpace::bounded(&[-MAX_TORQUE], &[MAX_TORQUE]))
+        }
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        let noisy = EnvSpec {
+            id: "NoisyPositionOnlyPendulum",
+            summary: "Swing a pendulum up, seeing only its angle, with noise",
+            arguments: ARGUMENTS,
+            ..Self::spec()
+        };
+        let positions = levels::<Self>(Self::spec(), ["", "max_episode_length=150", "max_episode_length=100"]);
+        [positions, levels::<Self>(noisy, ["", "noise_sigma=0.2", "noise_sigma=0.3"])].concat()
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let at = place(&IDS.concat(), given.id());
-        let (family, level) = (at / 3, at % 3);
         Parameters {
-            noise: (family == 1).then_some(DEVIATIONS[level]),
-            length: if family == 1 { LENGTHS[0] } else { LENGTHS[level] },
+            noise: noise(given),
+            gravity: 3.0 * given.float("g", 10.0) / 2.0,
+            length: given.int(MAX_LENGTH.name, 1) as u32,
             x_init: given.float("x_init", PI),
             y_init: given.float("y_init", 1.0),
         }
@@ -137,7 +139,7 @@ impl Task for Pendulum {
         let torque_cost = 0.001 * torque.powf(black_box(2.0));
         let angle = (self.angle + PI).rem_euclid(2.0 * PI) - PI;
         let cost = square(angle) + 0.1 * square(self.velocity) + f64::from(torque_cost);
-        self.swing(torque);
+        self.swing(torque, parameters.gravity);
         self.steps = self.steps.saturating_add(1);
         self.observe(parameters, random);
         let reward = (-cost + HALF_RANGE) / HALF_RANGE / f64::from(parameters.length);
@@ -175,10 +177,10 @@ impl Task for Pendulum {
             && shows(self.observation[1], self.angle.sin())
     }
 
-    fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        let at = place(&IDS.concat(), id);
+    fn expert(parameters: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Swing {
-            variance: if at / 3 == 1 { DEVIATIONS[at % 3].powi(2) } else { 1e-12 },
+            gravity: parameters.gravity,
+            variance: variance(parameters.noise),
             estimate: Pendulum::default(),
             filter: Filter::new(0.0, 0.0),
             last: None,
@@ -188,6 +190,7 @@ impl Task for Pendulum {
 
 /// Gives the pendulum the energy of the upright position, and balances it there. Estimates its motion from the observed angles.
 struct Swing {
+    gravity: f64,
     /// Variance of the observed cosine and sine.
     variance: f64,
     estimate: Pendulum,
@@ -209,8 +212,8 @@ impl Expert for Swing {
     fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
         let [cos, sin] = [features[0], features[1]].map(f64::from);
         if let Some(last) = self.last {
-            self.filter.predict(GRAVITY * self.estimate.angle.cos(), SECONDS, Self::GROWTH);
-            self.estimate.swing(last);
+            self.filter.predict(self.gravity * self.estimate.angle.cos(), SECONDS, Self::GROWTH);
+            self.estimate.swing(last, self.gravity);
             let error = sin * self.estimate.angle.cos() - cos * self.estimate.angle.sin();
             let [angle, velocity] = self.filter.correct(self.variance);
             self.estimate.angle += angle * error;
@@ -222,7 +225,7 @@ impl Expert for Swing {
         }
         let angle = (self.estimate.angle + PI).rem_euclid(2.0 * PI) - PI;
         let velocity = self.estimate.velocity;
-        let energy = velocity * velocity / 2.0 + GRAVITY * (angle.cos() - 1.0);
+        let energy = velocity * velocity / 2.0 + self.gravity * (angle.cos() - 1.0);
         let torque = if angle.abs() < 1.0 {
             -15.0 * angle - 4.0 * velocity
         } else {

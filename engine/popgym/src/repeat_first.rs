@@ -7,12 +7,9 @@ use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{DECK, Deck, Face};
-use crate::ids::{SUITS, ids, place};
+use crate::deck::{DECK, DECKS, Deck, Face, decks};
+use crate::ids::{SUITS, levels};
 use crate::pictures::{self, ALONE, PICTURE};
-
-const IDS: [&str; 3] = ids!("RepeatFirst");
-const DECKS: [usize; 3] = [1, 8, 16];
 
 /// Number of decks, and the reward.
 pub struct Parameters {
@@ -43,17 +40,18 @@ impl Task for RepeatFirst {
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(4)),
             markov_state: STATE,
+            arguments: &[DECKS],
             picture: Some(PICTURE),
-            ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
+            ..EnvSpec::new("RepeatFirst", summary, ActionSpace::Discrete(4))
         }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        IDS.map(|id| EnvSpec { id, ..Self::spec() }).into()
+        levels::<Self>(Self::spec(), ["", "num_decks=8", "num_decks=16"])
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let decks = DECKS[place(&IDS, given.id())];
+        let decks = decks(given);
         Parameters { decks, reward: 1.0 / (decks * DECK - 1) as f64 }
     }
 
@@ -90,7 +88,7 @@ impl Task for RepeatFirst {
             && self.deck.cards().last() == Some(&self.first)
     }
 
-    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+    fn expert(_: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Memory::default()))
     }
 }

@@ -3,19 +3,19 @@
 use std::collections::VecDeque;
 
 use endless_gym_core::envs::{
-    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, StatePart, Task, Transition,
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, Parameter, ParameterError, ResetParameters, StatePart,
+    Task, Transition,
 };
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{DECK, Deck, Face};
-use crate::ids::{INTEGER_ZERO, SUITS, ids, place, shape};
+use crate::deck::{DECK, DECKS, Deck, Face, decks};
+use crate::ids::{INTEGER_ZERO, SUITS, levels, shape};
 use crate::pictures::{self, ALONE, PICTURE};
 
-const IDS: [&str; 3] = ids!("RepeatPrevious");
-/// Number of decks, and which card to name: 1 is the card that is shown.
-const VARIANTS: [(usize, usize); 3] = [(1, 4), (2, 32), (3, 64)];
+const ARGUMENTS: &[Parameter] =
+    &[DECKS, Parameter::int("k", 4, 1, 3275, "which card to name: 1 is the one that is shown")];
 
 /// Number of decks, which card to name, and the reward.
 pub struct Parameters {
@@ -42,26 +42,33 @@ impl Task for RepeatPrevious {
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(4)),
             types: INTEGER_ZERO,
+            arguments: ARGUMENTS,
             picture: Some(PICTURE),
-            ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
+            ..EnvSpec::new("RepeatPrevious", summary, ActionSpace::Discrete(4))
         }
     }
 
     fn specs() -> Vec<EnvSpec> {
-        let spec = |(id, (_, k)): (_, (_, usize))| {
-            let suits = "the last suits that were shown, the oldest first; 0 before the first card";
-            let state = vec![
-                StatePart::integers("suits", 4, shape(&[k]), "int64", suits),
-                StatePart::shares("left", &[4], "share of the cards of each suit that has not been dealt"),
-            ];
-            EnvSpec { id, markov_state: state.leak(), ..Self::spec() }
-        };
-        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+        levels::<Self>(Self::spec(), ["", "num_decks=2&k=32", "num_decks=3&k=64"])
+    }
+
+    fn with_arguments(spec: EnvSpec, parameters: &Parameters) -> Result<EnvSpec, ParameterError> {
+        let Parameters { decks, k, .. } = *parameters;
+        if k >= decks * DECK {
+            let allowed = format!("less than the number of cards, {}", decks * DECK);
+            return Err(ParameterError::Argument { name: "k", value: k.to_string(), allowed });
+        }
+        let suits = "the last suits that were shown, the oldest first; 0 before the first card";
+        let state = vec![
+            StatePart::integers("suits", 4, shape(&[k]), "int64", suits),
+            StatePart::shares("left", &[4], "share of the cards of each suit that has not been dealt"),
+        ];
+        Ok(EnvSpec { markov_state: state.leak(), ..spec })
     }
 
     fn parameters(given: &ResetParameters) -> Parameters {
-        let (decks, k) = VARIANTS[place(&IDS, given.id())];
-        Parameters { decks, k, reward: 1.0 / (decks * DECK - k) as f64 }
+        let (decks, k) = (decks(given), given.int("k", 1) as usize);
+        Parameters { decks, k, reward: 1.0 / ((decks * DECK) as f64 - k as f64) }
     }
 
     fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
@@ -102,8 +109,7 @@ impl Task for RepeatPrevious {
         self.deck.is_valid(parameters.decks, Face::Suit, Some(self.card))
     }
 
-    fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        let (_, k) = VARIANTS[place(&IDS, id)];
+    fn expert(&Parameters { k, .. }: &Parameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(Memory { k, suits: VecDeque::with_capacity(k + 1) }))
     }
 }

@@ -20,6 +20,7 @@ pub fn random(draws: &mut Generator, id: &str) -> OptionMap {
 
 fn value(draws: &mut Generator, kind: ParameterKind) -> Json {
     match kind {
+        ParameterKind::Choice { default, .. } => default.into(),
         ParameterKind::Bool { .. } => Json::from(draws.integers(0, 2) == 1),
         ParameterKind::Int { default, min, max } => {
             let near = (2 * default.abs() + 200).clamp(min, max);

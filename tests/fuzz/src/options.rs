@@ -58,6 +58,7 @@ fn value(kind: &ParameterKind, input: &mut Unstructured<'_>) -> Result<Json> {
             let (from, to) = if input.arbitrary()? { (*min, *max) } else { (min.max(-near), max.min(near)) };
             Json::from(from + share * (to - from))
         }
+        (_, ParameterKind::Choice { choices, .. }) => input.choose(choices)?.to_owned().into(),
         (_, ParameterKind::IntList { min, max, .. }) => {
             let length = input.int_in_range(0..=4_u8)?;
             Json::from((0..length).map(|_| integer(*min, *max, input)).collect::<Result<Vec<_>>>()?)

@@ -59,6 +59,7 @@ fn traces_in(folder: &str, id: &str) -> Vec<PathBuf> {
 /// Any value within the parameter's limits, mostly not far from the default.
 fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
     match parameter.kind {
+        ParameterKind::Choice { choices, .. } => prop::sample::select(choices).prop_map(Json::from).boxed(),
         ParameterKind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
         ParameterKind::Int { default, min, max } => {
             let near = (2 * default.abs() + 200).clamp(min, max);

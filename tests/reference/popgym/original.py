@@ -1,5 +1,6 @@
 """The original environments, and the recording of their episodes. Needs popgym 1.0.7 with its extra navigation."""
 
+import json
 import random
 import warnings
 from collections.abc import Callable
@@ -17,11 +18,31 @@ IDS = [registered["id"] for registered in popgym.envs.ALL.values()]
 ERROR_RATES = (0.02, 0.1, 0.5, 1.0)
 
 
+CLASSES = {registered["id"]: kind for kind, registered in popgym.envs.ALL.items()}
+
+
+def made(env_id: str) -> Any:
+    """An environment; with arguments, as in `popgym-RepeatPreviousEasy-v0?k=2`, one of the class without a difficulty."""
+    name, _, arguments = env_id.partition("?")
+    if not arguments:
+        return gymnasium.make(name, disable_env_checker=True).unwrapped
+    given = (argument.split("=") for argument in arguments.split("&"))
+    return CLASSES[name].__base__(**{name: _value(text) for name, text in given})
+
+
+def _value(text: str) -> Any:
+    try:
+        values = json.loads(f"[{text}]")
+    except ValueError:
+        return text
+    return values if len(values) > 1 else values[0]
+
+
 class Original:
     """One environment object of the original, which can play several episodes in a row."""
 
     def __init__(self, env_id: str) -> None:
-        self.env: Any = gymnasium.make(env_id, disable_env_checker=True).unwrapped
+        self.env: Any = made(env_id)
         self.policy = next((policy for name, policy in POLICIES.items() if name in env_id), None)
 
     def episode(self, seed: int | None, options: dict[str, float], picker: random.Random) -> dict[str, Any]:

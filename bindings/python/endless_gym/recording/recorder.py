@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import os
+import re
 import threading
 import time
 from collections import deque
@@ -135,7 +135,8 @@ def record(
     observation = observation or described.default_observation
     frames, has_features = contents(described, observation, frames)
     threads = integer("num_threads", num_threads or _native.cores(), 1, _native.MAX_THREADS)
-    name = dataset or f"endless-gym/{described.id}/{_short(player)}-v0"
+    # Minari's names have neither `?` nor `=`.
+    name = dataset or f"endless-gym/{re.sub('[^a-zA-Z0-9_-]', '-', described.id)}/{_short(player)}-v0"
     start = time.perf_counter()
     total = 0.0
     writer = DatasetWriter(
@@ -218,8 +219,8 @@ def _env_spec(
     described: Spec, options: Sequence[Mapping[str, Any]], observation: ObservationName
 ) -> gymnasium.envs.registration.EnvSpec:
     """The specification that recreates the environment, with frames in the original's format, since Minari stores it as JSON."""
-    # A copy, since the registry's own must not change.
-    env_spec = copy.deepcopy(gymnasium.spec(f"EndlessGym/{described.id}"))
+    env_spec = described.registered()
+    assert env_spec is not None
     # Episodes are recorded in new environments; this one starts each of its episodes like a new one.
     env_spec.kwargs["independent_episodes"] = True
     if len(options) == 1 and options[0]:

@@ -9,6 +9,7 @@ use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::pool::{Pool, Registry, ResetRequest, StepTimes, Threads};
 use endless_gym_service::EngineConfig;
 use serde::Serialize;
+use serde_json::json;
 
 use crate::engine_process::EngineProcess;
 use crate::failure::Failure;
@@ -384,7 +385,7 @@ fn original(args: &Args, spec: &EnvSpec) -> Result<f64, Failure> {
 
 fn original_by(python: &str, args: &Args, spec: &EnvSpec) -> Result<f64, Failure> {
     let output = Command::new(python)
-        .args(["-c", ORIGINAL, spec.id, &args.seconds.to_string()])
+        .args(["-c", ORIGINAL, spec.id, &args.seconds.to_string(), &json!(spec.arguments).to_string()])
         .output()
         .map_err(|error| format!("cannot run {python}: {error}"))?;
     let failed = || {

@@ -79,12 +79,15 @@ fn description(spec: &EnvSpec) -> String {
     if !spec.ground_truth.is_empty() {
         parts.push(format!("ground truth float64 ({},)", spec.ground_truth.len()));
     }
-    let mut rows = table(["reset parameter", "default", "allowed", "description"]);
-    for parameter in spec.parameters {
-        rows.add_row([parameter.name, &parameter.default_text(), &parameter.allowed(), parameter.description]);
-    }
-    if !spec.parameters.is_empty() {
-        parts.push(format!("\n{rows}"));
+    for (title, parameters) in [("argument (`ID?NAME=VALUE&..`)", spec.arguments), ("reset parameter", spec.parameters)]
+    {
+        let mut rows = table([title, "default", "allowed", "description"]);
+        for parameter in parameters {
+            rows.add_row([parameter.name, &parameter.default_text(), &parameter.allowed(), parameter.description]);
+        }
+        if !parameters.is_empty() {
+            parts.push(format!("\n{rows}"));
+        }
     }
     let truth: Vec<_> = spec.ground_truth.iter().map(|column| [column.name, column.description]).collect();
     let info: Vec<_> = spec.info.iter().map(|column| [column.name, column.description]).collect();

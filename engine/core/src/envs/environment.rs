@@ -7,8 +7,9 @@ use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
 
 use super::expert::Expert;
-use super::parameters::ResetParameters;
+use super::parameters::{ParameterError, ResetParameters};
 use super::progress::Progress;
+use super::spec::EnvSpec;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
@@ -99,9 +100,18 @@ pub trait Environment: Send + Sync {
     /// episode.
     fn info(&self, out: &mut [f64]);
 
-    /// A scripted expert, if the family has one.
-    fn expert(_variant: Self::Variant) -> Option<Box<dyn Expert>> {
+    /// A scripted expert, if the family has one. `parameters` has the id's arguments.
+    fn expert(_variant: Self::Variant, _parameters: &ResetParameters) -> Option<Box<dyn Expert>> {
         None
+    }
+
+    /// Completes the specification of an id with arguments, as [`Task::with_arguments`](super::Task::with_arguments).
+    ///
+    /// # Errors
+    ///
+    /// [`ParameterError`] if the arguments do not go together.
+    fn with_arguments(spec: EnvSpec, _parameters: &ResetParameters) -> Result<EnvSpec, ParameterError> {
+        Ok(spec)
     }
 }
 

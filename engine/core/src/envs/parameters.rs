@@ -43,9 +43,16 @@ pub enum ParameterKind {
         /// Largest allowed value of an item.
         max: i64,
     },
+    /// One of several words.
+    Choice {
+        /// Default.
+        default: &'static str,
+        /// Allowed words.
+        choices: &'static [&'static str],
+    },
 }
 
-/// One reset parameter of an environment.
+/// One reset parameter of an environment, or one argument of its id.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Parameter {
     /// Name.
@@ -92,13 +99,24 @@ impl Parameter {
         Parameter { name, kind: ParameterKind::IntList { default, min, max }, description }
     }
 
-    /// The default as JSON text.
+    /// One of several words.
+    pub const fn choice(
+        name: &'static str,
+        default: &'static str,
+        choices: &'static [&'static str],
+        description: &'static str,
+    ) -> Self {
+        Parameter { name, kind: ParameterKind::Choice { default, choices }, description }
+    }
+
+    /// The default as JSON text; a word without quotes.
     pub fn default_text(&self) -> String {
         match self.kind {
             ParameterKind::Bool { default } => default.to_string(),
             ParameterKind::Int { default, .. } => default.to_string(),
             ParameterKind::Float { default, .. } => format!("{default:?}"),
             ParameterKind::IntList { default, .. } => format!("{default:?}"),
+            ParameterKind::Choice { default, .. } => default.to_owned(),
         }
     }
 
@@ -110,13 +128,14 @@ impl Parameter {
             ParameterKind::Int { min, max, .. } => format!("integer, {min} to {max}"),
             ParameterKind::Float { min, max, .. } => format!("number, {min} to {max}"),
             ParameterKind::IntList { min, max, .. } => format!("list of 1 to {MAX_LIST} integers, {min} to {max}"),
+            ParameterKind::Choice { choices, .. } => choices.join(" or "),
         }
     }
 
     /// A description of valid values for error messages: [`allowed`](Self::allowed) with an article.
     fn requirement(&self) -> String {
         let article = match self.kind {
-            ParameterKind::Bool { .. } => "",
+            ParameterKind::Bool { .. } | ParameterKind::Choice { .. } => "",
             ParameterKind::Int { .. } => "an ",
             ParameterKind::Float { .. } | ParameterKind::IntList { .. } => "a ",
         };
@@ -129,7 +148,31 @@ impl Parameter {
             ParameterKind::Int { default, .. } => Value::Int(default),
             ParameterKind::Float { default, .. } => Value::Float(default),
             ParameterKind::IntList { default, .. } => Value::IntList(default.to_vec()),
+            ParameterKind::Choice { default, .. } => Value::Choice(default),
         }
+    }
+
+    /// The argument with another value: JSON text, where words need no quotes and lists no brackets.
+    pub(super) fn with_default(self, text: &str) -> Result<Self, ParameterError> {
+        let is_list = matches!(self.kind, ParameterKind::IntList { .. }) && !text.starts_with('[');
+        let json = if is_list { serde_json::from_str(&format!("[{text}]")) } else { serde_json::from_str(text) };
+        let wrong =
+            |_| ParameterError::Argument { name: self.name, value: text.to_owned(), allowed: self.requirement() };
+        let kind = match (self.kind, self.parse(&json.unwrap_or_else(|_| text.into())).map_err(wrong)?) {
+            (ParameterKind::Int { min, max, .. }, Value::Int(default)) => ParameterKind::Int { default, min, max },
+            (ParameterKind::Float { min, max, .. }, Value::Float(default)) => {
+                ParameterKind::Float { default, min, max }
+            }
+            (ParameterKind::IntList { min, max, .. }, Value::IntList(items)) => {
+                ParameterKind::IntList { default: items.leak(), min, max }
+            }
+            (ParameterKind::Choice { choices, .. }, Value::Choice(default)) => {
+                ParameterKind::Choice { default, choices }
+            }
+            (_, Value::Bool(default)) => ParameterKind::Bool { default },
+            (kind, _) => kind,
+        };
+        Ok(Parameter { kind, ..self })
     }
 
     fn parse(&self, given: &Json) -> Result<Value, ParameterError> {
@@ -153,6 +196,14 @@ impl Parameter {
                 let fits = (1..=MAX_LIST).contains(&values.len()) && values.iter().all(|v| (min..=max).contains(v));
                 fits.then_some(Value::IntList(values)).ok_or_else(out_of_range)
             }
+            ParameterKind::Choice { choices, .. } => {
+                let given = given.as_str().ok_or_else(wrong_type)?;
+                choices
+                    .iter()
+                    .find(|choice| **choice == given)
+                    .map(|choice| Value::Choice(choice))
+                    .ok_or_else(out_of_range)
+            }
         }
     }
 }
@@ -168,9 +219,10 @@ enum Value {
     Int(i64),
     Float(f64),
     IntList(Vec<i64>),
+    Choice(&'static str),
 }
 
-/// A complete and valid set of reset parameters: the given values, and defaults for all others.
+/// A complete and valid set of reset parameters: the given values, and defaults for all others; and the arguments of the id.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResetParameters {
     id: &'static str,
@@ -178,14 +230,11 @@ pub struct ResetParameters {
 }
 
 impl ResetParameters {
-    /// Validates `given` against `parameters` and adds the defaults.
-    ///
-    /// # Errors
-    ///
-    /// If a name is unknown, or a value has the wrong type or is out of range.
-    pub fn new(
+    /// Validates `given` against `parameters` and adds the defaults, also those of `arguments`.
+    pub(super) fn new(
         id: &'static str,
         parameters: &'static [Parameter],
+        arguments: &'static [Parameter],
         given: &Map<String, Json>,
     ) -> Result<Self, ParameterError> {
         if let Some(name) = given.keys().find(|name| parameters.iter().all(|p| p.name != name.as_str())) {
@@ -195,6 +244,7 @@ impl ResetParameters {
         let values = parameters
             .iter()
             .map(|p| Ok((p.name, given.get(p.name).map_or_else(|| Ok(p.default_value()), |v| p.parse(v))?)))
+            .chain(arguments.iter().map(|argument| Ok((argument.name, argument.default_value()))))
             .collect::<Result<_, _>>()?;
         Ok(ResetParameters { id, values })
     }
@@ -227,6 +277,11 @@ impl ResetParameters {
     pub fn int_list(&self, name: &str) -> Vec<i64> {
         if let Some(Value::IntList(value)) = self.value(name) { value.clone() } else { Vec::new() }
     }
+
+    /// The word with that name; empty if the environment does not have it.
+    pub fn choice(&self, name: &str) -> &'static str {
+        if let Some(Value::Choice(value)) = self.value(name) { value } else { "" }
+    }
 }
 
 /// An invalid reset parameter.
@@ -246,6 +301,26 @@ pub enum ParameterError {
     #[error("reset parameter `{name}` must be {allowed}, got {value}")]
     WrongType {
         name: &'static str,
+        value: String,
+        /// Allowed type and range as text.
+        allowed: String,
+    },
+    /// The id has no argument with this name.
+    #[error("{id} has no argument `{name}`; it has {allowed}")]
+    UnknownArgument {
+        /// The id without arguments.
+        id: &'static str,
+        /// The given name.
+        name: String,
+        /// The id's arguments, separated by commas.
+        allowed: String,
+    },
+    /// The value of an argument of an id has the wrong type or is out of range.
+    #[error("argument `{name}` must be {allowed}, got {value}")]
+    Argument {
+        /// The argument's name.
+        name: &'static str,
+        /// The given value.
         value: String,
         /// Allowed type and range as text.
         allowed: String,

@@ -313,6 +313,8 @@ pub struct EnvSpec {
     pub keeps_state: bool,
     /// Reset parameters with their defaults and limits.
     pub parameters: &'static [Parameter],
+    /// Arguments of the id, as in `Maze-v0?size=9`, with its values as their defaults.
+    pub arguments: &'static [Parameter],
     /// The number by which agents are compared.
     pub metric: Metric,
     /// When the task counts as learnt; `None` for a task whose episodes get longer the better the agent is.
@@ -349,6 +351,7 @@ impl EnvSpec {
             types: OriginalTypes::DEFAULT,
             keeps_state: false,
             parameters: &[],
+            arguments: &[],
             metric: Metric::RETURN,
             learnt: Some(Learnt::by("success")),
             step_limit: |parameters| Some(parameters.int("max_steps", 0)).filter(|steps| *steps > 0),
@@ -380,11 +383,52 @@ impl EnvSpec {
     ///
     /// [`ParameterError`] if a reset parameter is unknown, or has the wrong type or range.
     pub fn max_episode_steps(&self, given: &Map<String, Json>) -> Result<Option<i64>, ParameterError> {
-        Ok((self.step_limit)(&ResetParameters::new(self.id, self.parameters, given)?))
+        Ok((self.step_limit)(&self.reset_parameters(given)?))
+    }
+
+    /// The given reset parameters, the defaults of all others, and the id's arguments.
+    ///
+    /// # Errors
+    ///
+    /// [`ParameterError`] if a name is unknown, or a value has the wrong type or is out of range.
+    pub fn reset_parameters(&self, given: &Map<String, Json>) -> Result<ResetParameters, ParameterError> {
+        ResetParameters::new(self.id, self.parameters, self.arguments, given)
+    }
+
+    /// The specification with these arguments, such as `size=9&goals=1,2`, in its id and in [`arguments`](EnvSpec::arguments). Spaces
+    /// that follow from them are as before. Its texts are never freed.
+    ///
+    /// # Errors
+    ///
+    /// [`ParameterError`] if a name is unknown, or a value has the wrong type or is out of range.
+    pub fn with_arguments(&self, given: &str) -> Result<EnvSpec, ParameterError> {
+        let mut arguments = self.arguments.to_vec();
+        for argument in given.split('&').filter(|argument| !argument.is_empty()) {
+            let (name, value) = argument.split_once('=').unwrap_or((argument, ""));
+            let known = arguments.iter_mut().find(|known| known.name == name);
+            let known = known.ok_or_else(|| ParameterError::UnknownArgument {
+                id: self.id,
+                name: name.to_owned(),
+                allowed: match self.arguments {
+                    [] => "none".to_owned(),
+                    known => known.iter().map(|known| known.name).collect::<Vec<_>>().join(", "),
+                },
+            })?;
+            *known = known.with_default(value)?;
+        }
+        let texts =
+            arguments.iter().zip(self.arguments).map(|(new, old)| (new, new.default_text(), old.default_text()));
+        let changed = texts.filter(|(_, new, old)| new != old);
+        let text = |(argument, text, _): (&Parameter, String, _)| {
+            format!("{}={}", argument.name, text.replace(['[', ']', ' '], ""))
+        };
+        let changed: Vec<_> = changed.map(text).collect();
+        let id = if changed.is_empty() { self.id } else { format!("{}?{}", self.id, changed.join("&")).leak() };
+        Ok(EnvSpec { id, arguments: arguments.leak(), ..self.clone() })
     }
 }
 
-/// The registry does not have this id.
+/// The registry does not have this id, or not with its arguments.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("no environment `{id}`; {}", self.hint())]
 pub struct UnknownEnvironment {
@@ -392,6 +436,8 @@ pub struct UnknownEnvironment {
     pub id: String,
     /// All known ids, separated by commas.
     pub known: String,
+    /// What is wrong with the arguments of a known id.
+    pub problem: Option<String>,
 }
 
 impl UnknownEnvironment {
@@ -422,11 +468,12 @@ impl UnknownEnvironment {
         }
     }
 
-    /// The likely ids, or all known ones.
+    /// What is wrong with the arguments, the likely ids, or all known ones.
     fn hint(&self) -> String {
-        match self.likely() {
-            Some(likely) => format!("did you mean {likely}? `endless list` shows all"),
-            None => format!("there are {}", self.known),
+        match (&self.problem, self.likely()) {
+            (Some(problem), _) => problem.clone(),
+            (None, Some(likely)) => format!("did you mean {likely}? `endless list` shows all"),
+            (None, None) => format!("there are {}", self.known),
         }
     }
 }
@@ -446,7 +493,7 @@ mod tests {
             ("xyz", None),
         ] {
             let known = "Maze-v0, Maze-Grid-v0, p-CountEasy-v0, p-CountHard-v0, p-A, p-B, p-C, p-D, p-E".to_owned();
-            let error = UnknownEnvironment { id: given.to_owned(), known };
+            let error = UnknownEnvironment { id: given.to_owned(), known, problem: None };
             assert_eq!(error.likely().as_deref(), likely, "{given}");
         }
     }

@@ -7,7 +7,7 @@ use serde::{Serialize, de::DeserializeOwned};
 
 use super::environment::{Environment, InvalidState, Transition};
 use super::expert::Expert;
-use super::parameters::ResetParameters;
+use super::parameters::{ParameterError, ResetParameters};
 use super::progress::Progress;
 use super::spec::EnvSpec;
 use crate::random::Generator;
@@ -89,8 +89,18 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
         vec![Self::spec()]
     }
 
-    /// The typed reset parameters. `given` is complete, every value is within its limits, and its
-    /// [`id`](ResetParameters::id) says which of several ids is played.
+    /// Completes the specification of an id with arguments, such as `Maze-v0?size=9`, which has the spaces of that without: spaces and
+    /// columns that follow from the arguments. `parameters` are those of an episode without reset parameters.
+    ///
+    /// # Errors
+    ///
+    /// [`ParameterError::Argument`] if the arguments do not go together.
+    fn with_arguments(spec: EnvSpec, _parameters: &Self::Parameters) -> Result<EnvSpec, ParameterError> {
+        Ok(spec)
+    }
+
+    /// The typed reset parameters. `given` is complete with the [`arguments`](EnvSpec::arguments) of the id, every value is within its
+    /// limits, and its [`id`](ResetParameters::id) says which of several ids is played.
     fn parameters(given: &ResetParameters) -> Self::Parameters;
 
     /// Seeds the generators that the rules keep themselves, before the reset of an episode that has a seed. Rules that only draw
@@ -127,8 +137,8 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
         Vec::new()
     }
 
-    /// A scripted expert for an id, if there is one.
-    fn expert(_id: &str) -> Option<Box<dyn Expert>> {
+    /// A scripted expert for an id, if there is one, from the parameters of an episode without reset parameters.
+    fn expert(_parameters: &Self::Parameters) -> Option<Box<dyn Expert>> {
         None
     }
 
@@ -146,13 +156,12 @@ pub struct TaskEnv<T: Task> {
 }
 
 impl<T: Task> Environment for TaskEnv<T> {
-    /// The id.
-    type Variant = &'static str;
+    type Variant = ();
     type Assets = T::Parameters;
     type State = T;
     type Scene = T;
 
-    fn assets(_id: &'static str, parameters: &ResetParameters) -> T::Parameters {
+    fn assets((): (), parameters: &ResetParameters) -> T::Parameters {
         T::parameters(parameters)
     }
 
@@ -230,7 +239,11 @@ impl<T: Task> Environment for TaskEnv<T> {
         self.task.info(&self.parameters, out);
     }
 
-    fn expert(id: &'static str) -> Option<Box<dyn Expert>> {
-        T::expert(id)
+    fn expert((): (), parameters: &ResetParameters) -> Option<Box<dyn Expert>> {
+        T::expert(&T::parameters(parameters))
+    }
+
+    fn with_arguments(spec: EnvSpec, parameters: &ResetParameters) -> Result<EnvSpec, ParameterError> {
+        T::with_arguments(spec, &T::parameters(parameters))
     }
 }

@@ -8,7 +8,7 @@ use super::error::PoolError;
 use super::seeding::{MAX_TOTAL_ENVS, Seeding};
 use crate::batch::limits::MAX_ENVS;
 use crate::batch::{Contents, Frames, MAX_STACK, batch_layout};
-use crate::envs::{EnvSpec, ResetParameters};
+use crate::envs::EnvSpec;
 
 /// Reset parameters by name, as a JSON object.
 pub type OptionMap = Map<String, Json>;
@@ -204,7 +204,7 @@ impl PoolConfig {
     pub fn validate(&self, spec: &EnvSpec) -> Result<(), PoolError> {
         self.check(spec)?;
         batch_layout(spec, self.num_envs, self.contents())?;
-        let check = |given: &OptionMap| ResetParameters::new(spec.id, spec.parameters, given).map(drop);
+        let check = |given: &OptionMap| spec.reset_parameters(given).map(drop);
         match &self.options {
             ResetOptions::Shared(given) => Ok(check(given)?),
             ResetOptions::Each(each) => each.iter().enumerate().try_for_each(|(env, given)| {

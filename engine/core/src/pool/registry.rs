@@ -1,15 +1,17 @@
 //! The environments that a program knows.
 
+use std::collections::HashMap;
 use std::fmt;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
+use serde_json::Map;
 use thiserror::Error;
 
 use super::config::PoolConfig;
 use super::error::PoolError;
 use super::seeding::PoolEntropy;
 use super::typed_envs::{AnyEnvs, typed_envs};
-use crate::envs::{EnvSpec, Environment, Expert, ObservationSpace, Task, TaskEnv, UnknownEnvironment};
+use crate::envs::{EnvSpec, Environment, Expert, ObservationSpace, ParameterError, Task, TaskEnv, UnknownEnvironment};
 use crate::raster::FrameShape;
 
 /// Environment ids with their implementations. Pools, engines and commands look up ids in the registry that they are given.
@@ -18,6 +20,8 @@ use crate::raster::FrameShape;
 #[derive(Clone, Default)]
 pub struct Registry {
     entries: Vec<Arc<Entry>>,
+    /// Ids with arguments, as they were given. They are never freed, since specifications are borrowed.
+    made: Arc<Mutex<HashMap<String, &'static Arc<Entry>>>>,
 }
 
 impl Registry {
@@ -36,23 +40,10 @@ impl Registry {
         spec: EnvSpec,
         variant: E::Variant,
     ) -> Result<(), RegistryError> {
-        let id = spec.id;
-        if self.specs().any(|known| known.id == id) {
-            return Err(RegistryError::Duplicate { id });
+        if self.specs().any(|known| known.id == spec.id) {
+            return Err(RegistryError::Duplicate { id: spec.id });
         }
-        if let Some(given) = spec.shown().filter(|frame| !frame.is_valid()) {
-            return Err(RegistryError::Frame { id, given });
-        }
-        if spec.frame.is_none() && spec.features.is_empty() {
-            return Err(RegistryError::NoObservation { id });
-        }
-        let features = spec.features.len();
-        if let Some(given) =
-            spec.observation_space.as_ref().map(ObservationSpace::width).filter(|width| *width != features)
-        {
-            return Err(RegistryError::ObservationSpace { id, given, features });
-        }
-        self.entries.push(Arc::new(Entry { spec, family: Box::new(Family::<E> { variant }) }));
+        self.entries.push(Arc::new(Entry::new(spec, Arc::new(Family::<E> { variant }))?));
         Ok(())
     }
 
@@ -63,8 +54,7 @@ impl Registry {
     /// [`RegistryError`] if the registry has an id already, or if a specification contradicts itself.
     pub fn with<T: Task>(mut self) -> Result<Self, RegistryError> {
         for spec in T::specs() {
-            let id = spec.id;
-            self.register::<TaskEnv<T>>(spec, id)?;
+            self.register::<TaskEnv<T>>(spec, ())?;
         }
         Ok(self)
     }
@@ -74,11 +64,11 @@ impl Registry {
         self.entries.iter().map(|entry| &entry.spec)
     }
 
-    /// The specification of an id, of which only [`bare_id`](Self::bare_id) counts.
+    /// The specification of an id, of which only [`bare_id`](Self::bare_id) counts. It may have arguments, as in `Maze-v0?size=9`.
     ///
     /// # Errors
     ///
-    /// [`UnknownEnvironment`] if the registry does not have the id.
+    /// [`UnknownEnvironment`] if the registry does not have the id, or not with its arguments.
     pub fn spec(&self, id: &str) -> Result<&EnvSpec, UnknownEnvironment> {
         Ok(&self.entry(id)?.spec)
     }
@@ -89,7 +79,7 @@ impl Registry {
     ///
     /// [`NoExpert`] if the registry does not have the id, or its family has no expert.
     pub fn expert(&self, id: &str) -> Result<Box<dyn Expert>, NoExpert> {
-        let expert = self.entry(id).ok().and_then(|entry| entry.family.expert());
+        let expert = self.entry(id).ok().and_then(|entry| entry.family.expert(&entry.spec));
         expert.ok_or_else(|| NoExpert { id: id.to_owned() })
     }
 
@@ -100,11 +90,20 @@ impl Registry {
     }
 
     pub(super) fn entry(&self, id: &str) -> Result<&Arc<Entry>, UnknownEnvironment> {
-        let id = Registry::bare_id(id);
-        self.entries.iter().find(|entry| entry.spec.id == id).ok_or_else(|| UnknownEnvironment {
-            id: id.to_owned(),
-            known: self.specs().map(|spec| spec.id).collect::<Vec<_>>().join(", "),
-        })
+        let given = Registry::bare_id(id);
+        let (id, arguments) = given.split_once('?').unwrap_or((given, ""));
+        let error = |known, problem| UnknownEnvironment { id: given.to_owned(), known, problem };
+        let known = || self.specs().map(|spec| spec.id).collect::<Vec<_>>().join(", ");
+        let entry = self.entries.iter().find(|entry| entry.spec.id == id).ok_or_else(|| error(known(), None))?;
+        if arguments.is_empty() {
+            return Ok(entry);
+        }
+        let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        if !made.contains_key(given) {
+            let new = entry.with_arguments(arguments).map_err(|problem| error(String::new(), Some(problem)))?;
+            made.insert(given.to_owned(), Box::leak(Box::new(Arc::new(new))));
+        }
+        Ok(made[given])
     }
 }
 
@@ -117,10 +116,32 @@ impl fmt::Debug for Registry {
 /// An id and its implementation.
 pub(super) struct Entry {
     pub spec: EnvSpec,
-    family: Box<dyn AnyFamily>,
+    family: Arc<dyn AnyFamily>,
 }
 
 impl Entry {
+    fn new(spec: EnvSpec, family: Arc<dyn AnyFamily>) -> Result<Self, RegistryError> {
+        let (id, features) = (spec.id, spec.features.len());
+        if let Some(given) = spec.shown().filter(|frame| !frame.is_valid()) {
+            return Err(RegistryError::Frame { id, given });
+        }
+        if spec.frame.is_none() && spec.features.is_empty() {
+            return Err(RegistryError::NoObservation { id });
+        }
+        let width = spec.observation_space.as_ref().map(ObservationSpace::width);
+        match width.filter(|width| *width != features) {
+            Some(given) => Err(RegistryError::ObservationSpace { id, given, features }),
+            None => Ok(Entry { spec, family }),
+        }
+    }
+
+    /// The same environment with arguments, or what is wrong with them.
+    fn with_arguments(&self, arguments: &str) -> Result<Entry, String> {
+        let spec = self.spec.with_arguments(arguments).and_then(|spec| self.family.with_arguments(spec));
+        let entry = Entry::new(spec.map_err(|error| error.to_string())?, Arc::clone(&self.family));
+        entry.map_err(|error| error.to_string())
+    }
+
     /// Makes the environments of a pool.
     pub fn envs(&self, config: &PoolConfig, entropy: PoolEntropy) -> Result<Box<dyn AnyEnvs>, PoolError> {
         self.family.envs(&self.spec, config, entropy)
@@ -131,7 +152,9 @@ impl Entry {
 trait AnyFamily: Send + Sync {
     fn envs(&self, spec: &EnvSpec, config: &PoolConfig, entropy: PoolEntropy) -> Result<Box<dyn AnyEnvs>, PoolError>;
 
-    fn expert(&self) -> Option<Box<dyn Expert>>;
+    fn expert(&self, spec: &EnvSpec) -> Option<Box<dyn Expert>>;
+
+    fn with_arguments(&self, spec: EnvSpec) -> Result<EnvSpec, ParameterError>;
 }
 
 struct Family<E: Environment> {
@@ -143,8 +166,13 @@ impl<E: Environment + 'static> AnyFamily for Family<E> {
         Ok(Box::new(typed_envs::<E>(spec, self.variant, config, entropy)?))
     }
 
-    fn expert(&self) -> Option<Box<dyn Expert>> {
-        E::expert(self.variant)
+    fn expert(&self, spec: &EnvSpec) -> Option<Box<dyn Expert>> {
+        E::expert(self.variant, &spec.reset_parameters(&Map::new()).ok()?)
+    }
+
+    fn with_arguments(&self, spec: EnvSpec) -> Result<EnvSpec, ParameterError> {
+        let parameters = spec.reset_parameters(&Map::new())?;
+        E::with_arguments(spec, &parameters)
     }
 }
 

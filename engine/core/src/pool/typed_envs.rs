@@ -21,7 +21,7 @@ use super::threads::Threads;
 use crate::batch::BatchMut;
 use crate::disjoint::DisjointSlice;
 use crate::envs::view::{self, Picture};
-use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters};
+use crate::envs::{EnvSpec, Environment, ParameterError, Progress};
 use crate::raster::FrameShape;
 
 /// Arguments for writing a batch.
@@ -107,7 +107,7 @@ pub(super) fn typed_envs<E: Environment>(
 ) -> Result<TypedEnvs<E>, PoolError> {
     // An environment's options, and the assets made from them.
     let make = |given: &OptionMap| -> Result<(Arc<OptionMap>, Arc<E::Assets>), ParameterError> {
-        let parameters = ResetParameters::new(spec.id, spec.parameters, given)?;
+        let parameters = spec.reset_parameters(given)?;
         Ok((Arc::new(given.clone()), Arc::new(E::assets(variant, &parameters))))
     };
     let made: Vec<_> = match &config.options {
@@ -193,7 +193,7 @@ impl<E: Environment> TypedEnvs<E> {
                 return Ok((Arc::clone(assets), Arc::clone(known)));
             }
         }
-        let parameters = ResetParameters::new(self.spec.id, self.spec.parameters, options)?;
+        let parameters = self.spec.reset_parameters(options)?;
         Ok((Arc::new(E::assets(self.variant, &parameters)), Arc::new(options.clone())))
     }
 }

@@ -22,7 +22,7 @@ pub use state::State;
 
 use crate::character_sprites::CharacterSprites;
 use crate::shared_methods::shared_methods;
-use endless_gym_core::envs::{Environment, Expert, InvalidState};
+use endless_gym_core::envs::{Environment, Expert, InvalidState, ResetParameters};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 use state::DisplayedCharacter;
@@ -102,7 +102,7 @@ impl Environment for MortarMayhem {
         }
     }
 
-    fn expert(variant: Variant) -> Option<Box<dyn Expert>> {
+    fn expert(variant: Variant, _: &ResetParameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(expert::MortarExpert::new(variant)))
     }
 }

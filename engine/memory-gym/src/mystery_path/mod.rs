@@ -39,7 +39,7 @@ pub use scene::Scene;
 pub use state::State;
 
 use crate::shared_methods::shared_methods;
-use endless_gym_core::envs::{Environment, Expert, InvalidState};
+use endless_gym_core::envs::{Environment, Expert, InvalidState, ResetParameters};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 
@@ -101,7 +101,7 @@ impl Environment for MysteryPath {
         }
     }
 
-    fn expert(variant: Variant) -> Option<Box<dyn Expert>> {
+    fn expert(variant: Variant, _: &ResetParameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(expert::PathExpert::new(variant)))
     }
 }

@@ -7,7 +7,7 @@ use super::features::{BACKGROUND, FALLEN, PAST_PATH, PAST_SHIFT, STAMINA};
 use super::path::{GRID, Tile};
 use super::{IDS, MysteryPath, State, Variant};
 use crate::screen::{FRAME, SCREEN};
-use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters, Transition};
+use endless_gym_core::envs::{EnvSpec, Environment, Transition};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 
@@ -27,7 +27,7 @@ impl Game {
     fn new(number: usize, options: &Json, seed: u64) -> Self {
         let (spec, variant) = &IDS[number];
         let given: Map<String, Json> = options.as_object().unwrap().clone();
-        let parameters = ResetParameters::new(spec.id, spec.parameters, &given).unwrap();
+        let parameters = spec.reset_parameters(&given).unwrap();
         let assets = Arc::new(MysteryPath::assets(*variant, &parameters));
         let mut game = Game { spec, env: MysteryPath::new(&assets), random: Generator::from_seed(seed) };
         game.env.reset(&assets, &mut game.random);

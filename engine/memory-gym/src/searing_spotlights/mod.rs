@@ -52,7 +52,7 @@ pub use scene::Scene;
 pub use state::State;
 
 use crate::shared_methods::shared_methods;
-use endless_gym_core::envs::{Environment, Expert, InvalidState};
+use endless_gym_core::envs::{Environment, Expert, InvalidState, ResetParameters};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 
@@ -113,7 +113,7 @@ impl Environment for SearingSpotlights {
         }
     }
 
-    fn expert(variant: Variant) -> Option<Box<dyn Expert>> {
+    fn expert(variant: Variant, _: &ResetParameters) -> Option<Box<dyn Expert>> {
         Some(Box::new(expert::SpotlightsExpert::new(variant)))
     }
 }

@@ -8,7 +8,7 @@ use serde_json::{Map, Value as Json, json};
 use super::features::{AGENT, COIN, EXIT, HEALTH, HIT, LAST_ACTION, LIGHT, SPOTLIGHT};
 use super::{Assets, IDS, MAX_SPOTLIGHTS, SearingSpotlights, Variant};
 use crate::screen::{FRAME, SCREEN};
-use endless_gym_core::envs::{EnvSpec, Environment, Parameter, ParameterKind, ResetParameters};
+use endless_gym_core::envs::{EnvSpec, Environment, Parameter, ParameterKind};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Surface};
 
@@ -16,7 +16,7 @@ static FINITE: LazyLock<&EnvSpec> = LazyLock::new(|| &IDS[0].0);
 static ENDLESS: LazyLock<&EnvSpec> = LazyLock::new(|| &IDS[1].0);
 
 fn assets(spec: &'static EnvSpec, options: &Map<String, Json>) -> Arc<Assets> {
-    let parameters = ResetParameters::new(spec.id, spec.parameters, options).unwrap();
+    let parameters = spec.reset_parameters(options).unwrap();
     let variant = Variant { endless: spec.id == ENDLESS.id };
     Arc::new(SearingSpotlights::assets(variant, &parameters))
 }
@@ -66,6 +66,7 @@ fn walk(environment: &mut SearingSpotlights, random: &mut Generator, to: (i32, i
 /// A value within the option's limits, often at one of them.
 fn any_value(parameter: &Parameter) -> BoxedStrategy<Json> {
     match parameter.kind {
+        ParameterKind::Choice { choices, .. } => prop::sample::select(choices).prop_map(Json::from).boxed(),
         ParameterKind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
         ParameterKind::Int { default, min, max } => {
             prop_oneof![Just(min), Just(max), Just(default), (min.max(-9)..=max.min(9))].prop_map(Json::from).boxed()
