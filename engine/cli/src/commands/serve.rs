@@ -22,7 +22,7 @@ use crate::stop::{self, Watchdog};
 const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The arguments, or groups of arguments, that make up a configuration.
-const CONFIGURATION: [&str; 13] = [
+const CONFIGURATION: [&str; 14] = [
     "EnvironmentArgs",
     "FrameArgs",
     "id",
@@ -34,6 +34,7 @@ const CONFIGURATION: [&str; 13] = [
     "autoreset",
     "final_observation",
     "features",
+    "state",
     "batches_held",
     "checkpoint",
 ];
@@ -89,6 +90,9 @@ struct EngineArgs {
     /// Also write the feature observation, a float32 vector that describes what the frame shows.
     #[arg(long)]
     features: bool,
+    /// Also write the hidden Markov state, of environments that tell it: those of POPGym.
+    #[arg(long)]
+    state: bool,
     #[command(flatten)]
     frames: FrameArgs,
     /// Batches of each group that the trainer may hold at a time, 1 to 16.
@@ -113,7 +117,8 @@ impl EngineArgs {
             .autoreset(self.autoreset)
             .final_observation(self.final_observation)
             .frames(self.frames.frames())
-            .features(self.features);
+            .features(self.features)
+            .state(self.state);
         let checkpoint =
             self.checkpoint.clone().map(|path| CheckpointConfig::new(path).every(self.every).resume(self.resume));
         let (groups, batches_held) = (self.groups, self.batches_held);
