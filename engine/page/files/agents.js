@@ -1,25 +1,19 @@
 // The trained agents, and their results on the page.
 
-/** The files of the page's agents, without their ending: the id of the environment, with `-none` for an agent without memory. */
-const IDS = [
-  "Endless-MortarMayhem-v0-none",
-  "Endless-MortarMayhem-v0",
-  "MortarMayhem-Grid-v0",
-  "MysteryPath-Grid-v0",
-  "SearingSpotlights-v0",
-];
-
-/** Minutes of their training on one core. */
+/** Minutes of training on one core of the page's agents, by the name of their file without its ending: the id of the environment, with
+    `-none` for an agent without memory. */
 const MINUTES = {
   "Endless-MortarMayhem-v0": 32,
   "Endless-MortarMayhem-v0-none": 3,
+  "Endless-MysteryPath-v0-none": 1,
+  "Endless-SearingSpotlights-v0-none": 1,
   "MortarMayhem-Grid-v0": 12,
   "MysteryPath-Grid-v0": 17,
   "SearingSpotlights-v0": 9,
 };
 
 /** The environments with an agent that has a memory. */
-const PLAYED = IDS.filter((name) => !name.endsWith("-none"));
+const PLAYED = Object.keys(MINUTES).filter((name) => !name.endsWith("-none"));
 
 export class Agents {
   #loaded = new Map();
@@ -37,7 +31,7 @@ export class Agents {
 
   /** The page's files of agents for an environment, that with memory first. */
   names(id) {
-    return [id, `${id}-none`].filter((name) => IDS.includes(name));
+    return [id, `${id}-none`].filter((name) => name in MINUTES);
   }
 
   /** Why there is no agent, or an empty string. */
@@ -111,7 +105,7 @@ export class Agents {
     };
     const measured = evaluation.map((result) => `; ${share(result)}`).join("");
     const trained = steps < 1e6 ? steps.toLocaleString("en") : `${(steps / 1e6).toFixed(1)} million`;
-    const minutes = !this.isOwn(id) && MINUTES[id] ? `, ${MINUTES[id]} minutes on one core` : "";
+    const minutes = this.isOwn(id) ? "" : `, ${MINUTES[id]} minutes on one core`;
     return `${title}, trained for ${trained} steps${minutes}${measured}.`;
   }
 }

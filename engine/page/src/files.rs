@@ -77,9 +77,10 @@ pub fn files(engine: &[u8], has_id: impl Fn(&str) -> bool) -> Vec<(&'static str,
 #[cfg(test)]
 #[test]
 fn the_page_offers_the_agents_whose_files_it_has() {
+    use std::collections::BTreeSet;
+
     let script = String::from_utf8(decompress(file("agents.js").unwrap())).unwrap();
-    let list = script.split_once("const IDS = [").unwrap().1.split_once(']').unwrap().0;
-    let offered: Vec<&str> = list.split('"').skip(1).step_by(2).collect();
-    let found: Vec<&str> = FILES.iter().filter_map(|(name, _)| name.strip_suffix(AGENT)).collect();
-    assert_eq!(offered, found);
+    let table = script.split_once("const MINUTES = {").unwrap().1.split_once('}').unwrap().0;
+    let offered = table.split('"').skip(1).step_by(2).collect::<BTreeSet<_>>();
+    assert_eq!(offered, FILES.iter().filter_map(|(name, _)| name.strip_suffix(AGENT)).collect());
 }

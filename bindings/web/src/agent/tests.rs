@@ -1,5 +1,6 @@
 //! Compares the page's agents with outputs recorded from PyTorch and with the trainer, and reads broken files.
 
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clap::{Args, Command, FromArgMatches};
@@ -34,21 +35,16 @@ fn largest_difference(found: &[f32], expected: &[f32]) -> f32 {
 
 #[test]
 fn the_networks_compute_what_pytorch_computes() {
-    let (of_the_page, of_tests) = ("../../engine/page/files", "tests/agents");
-    for (folder, name) in [
-        (of_the_page, "Endless-MortarMayhem-v0-none"),
-        (of_the_page, "Endless-MortarMayhem-v0"),
-        (of_the_page, "MortarMayhem-Grid-v0"),
-        (of_the_page, "MysteryPath-Grid-v0"),
-        (of_the_page, "SearingSpotlights-v0"),
-        // Two layers of two heads each.
-        (of_tests, "gated-deltanet"),
-        (of_tests, "mamba2"),
-        (of_tests, "retnet"),
-    ] {
-        let file = std::fs::read(format!("{folder}/{name}.safetensors")).unwrap();
-        assert!(file.len() <= 100_000, "{name}: {} bytes", file.len());
-        let vectors = std::fs::read_to_string(format!("{of_tests}/{name}.json")).unwrap();
+    // Those of the page, and three with two layers of two heads each.
+    let folders = ["../../engine/page/files", "tests/agents"].map(|folder| std::fs::read_dir(folder).unwrap());
+    let files = folders.into_iter().flatten().map(|file| file.unwrap().path());
+    let files: Vec<_> = files.filter(|path| path.extension().is_some_and(|ending| ending == "safetensors")).collect();
+    assert!(files.len() >= 8, "{files:?}");
+    for path in files {
+        let file = std::fs::read(&path).unwrap();
+        assert!(file.len() <= 96 << 10, "{}: {} bytes", path.display(), file.len());
+        let vectors = Path::new("tests/agents").join(path.file_name().unwrap()).with_extension("json");
+        let vectors = std::fs::read_to_string(vectors).unwrap();
         computes(&Agent::read(&file).unwrap(), &serde_json::from_str(&vectors).unwrap());
     }
 }
