@@ -25,7 +25,8 @@ pub(crate) struct Point {
     pub steps_per_second: f64,
     /// Episodes that have ended since the engine started.
     pub episodes: u64,
-    /// Means over the last episodes, at least [`WINDOW`] if there are as many; `None` before the first.
+    /// Means over the last episodes that ended while somebody watched: [`WINDOW`] or a few more, or all if there are fewer. Over all
+    /// episodes of the engine if these are at most [`WINDOW`], or if none ended while somebody watched. `None` before the first.
     pub mean_return: Option<f64>,
     pub mean_length: Option<f64>,
     pub success_rate: Option<f64>,

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use endless_gym_core::envs::InfoColumn;
 use endless_gym_service::{
     ConnectConfig, EngineStatus, ErrorKind, Observer, Pictures, ServiceError, ServiceSpecification,
 };
@@ -208,7 +209,7 @@ impl Observation {
         if status.incarnation != self.specification.incarnation {
             return;
         }
-        let has_success = self.specification.info.iter().any(|name| name == "success");
+        let has_success = self.specification.info.iter().any(|name| name == InfoColumn::SUCCESS);
         channel.history().point(&status, has_success);
         if with_details {
             self.details = Details::of(&status, &channel.namespace);

@@ -52,6 +52,9 @@ impl InfoColumn {
     /// Task progress. Traces omit it, since the original does not return it.
     pub const TASK_PROGRESS: InfoColumn =
         InfoColumn { name: "task_progress", is_integer: false, description: "share of the task that was done, 0 to 1" };
+
+    /// Name of the column that is 1 if the agent succeeded, in environments that define success.
+    pub const SUCCESS: &str = "success";
 }
 
 /// The number of an episode by which agents are compared.
@@ -353,7 +356,7 @@ impl EnvSpec {
             parameters: &[],
             arguments: &[],
             metric: Metric::RETURN,
-            learnt: Some(Learnt::by("success")),
+            learnt: Some(Learnt::by(InfoColumn::SUCCESS)),
             step_limit: |parameters| Some(parameters.int("max_steps", 0)).filter(|steps| *steps > 0),
             render_fps: 25,
         }

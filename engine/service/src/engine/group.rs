@@ -1,6 +1,7 @@
 //! One group of an engine: its pool, its ports, and how it executes requests.
 
 use endless_gym_core::batch::{ActionLayout, ActionSection, Batch, Block, LAYOUT_VERSION, SNAPSHOT_BYTES};
+use endless_gym_core::envs::InfoColumn;
 use endless_gym_core::pool::{
     EnvReset, NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError, Threads,
 };
@@ -28,9 +29,6 @@ pub(crate) type ResponseLoan = SampleMut<Ipc, [PayloadBlock], ResponseHeader>;
 
 /// Why a request is rejected, and an explanation.
 pub(crate) type Rejected = (Rejection, String);
-
-/// The info that is 1 after a success.
-const SUCCESS: &str = "success";
 
 /// What the response to a request holds.
 pub(crate) enum Outcome {
@@ -274,7 +272,7 @@ impl Group {
         let (env_steps, ended) = match kind {
             RequestKind::Step => {
                 let batch = Batch::new(self.pool.layout(), batch);
-                let success = self.pool.spec().info.iter().position(|column| column.name == SUCCESS);
+                let success = self.pool.spec().info.iter().position(|column| column.name == InfoColumn::SUCCESS);
                 (batch.terminated().len(), Ended::of(&batch, success))
             }
             _ => (0, Ended::default()),
