@@ -44,7 +44,9 @@ fn the_token_the_host_and_the_origin_are_required() {
     let body = String::from_utf8(body).unwrap();
     // The server has every file that the page uses.
     assert!(body.contains(&format!("<base href=\"/{token}/\">")), "{body}");
-    for name in ["style.css", "view.css", "icon.svg", "view.js", "frames.js", "curves.js", "engines.js", "numbers.js"] {
+    for name in
+        ["style.css", "view.css", "icon.svg", "dom.js", "view.js", "frames.js", "curves.js", "engines.js", "numbers.js"]
+    {
         let (status, headers, body) = server.get(&format!("/{token}/{name}"), &[]);
         assert!(status == 200 && !body.is_empty(), "{name}: {headers}");
     }

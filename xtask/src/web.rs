@@ -94,7 +94,11 @@ pub fn build() -> Result<(), String> {
     }
     let compress = |bytes: &[u8]| io::copy(&mut GzEncoder::new(bytes, Compression::default()), &mut io::sink());
     // Reading from memory does not fail.
-    let is_first = |name: &str| !name.ends_with(".safetensors") || name.starts_with("Endless-MortarMayhem-v0");
+    // Agents are loaded when they are chosen, except for those of the landing, whose environment app.js names.
+    let app = files.iter().find(|(name, _)| *name == "app.js").map(|(_, bytes)| String::from_utf8_lossy(bytes));
+    let is_landing = |id: &str| app.as_ref().is_some_and(|app| app.contains(&format!("\"{id}\"")));
+    let is_first =
+        |name: &str| name.strip_suffix(".safetensors").is_none_or(|agent| is_landing(agent.trim_end_matches("-none")));
     let first: Vec<_> = files.iter().filter(|(name, _)| is_first(name)).collect();
     let compressed: u64 = first.iter().flat_map(|(_, bytes)| compress(bytes)).sum();
     println!(

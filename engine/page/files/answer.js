@@ -1,14 +1,15 @@
 // The answer at the end of a visitor's episode: the scores of the visitor and of the page's agents, which play the same episode, and what
 // was to be remembered.
 
+import { $, make } from "./dom.js";
 import { clueNode } from "./memory.js";
 import { scoreOf } from "./tasks.js";
-
-const $ = (id) => document.getElementById(id);
 
 export class Answer {
   #worker = null;
   #shown = null;
+  /** The number of the last question to the worker; answers to earlier ones may still arrive. */
+  #asked = 0;
 
   /** Calls `say` with the scores, for screen readers. */
   constructor(engine, agents, say) {
@@ -19,6 +20,7 @@ export class Answer {
   show(state) {
     if (state === this.#shown) return;
     this.#shown = state;
+    this.#asked += 1;
     $("answer").hidden = !state;
     if (!state) return;
     const node = clueNode(state);
@@ -29,14 +31,13 @@ export class Answer {
     if (files.length === 0) return;
     this.#worker ??= this.#start();
     const { id, options, seed } = state;
-    this.#worker.postMessage({ module: this.engine.module, files, episode: { id, options, seed: seed ?? "0" } });
+    this.#worker.postMessage({ asked: this.#asked, module: this.engine.module, files, episode: { id, options, seed: seed ?? "0" } });
   }
 
   #start() {
     const worker = new Worker(new URL("score-worker.js", import.meta.url), { type: "module" });
-    worker.addEventListener("message", ({ data: { episode, name, state, isOver } }) => {
-      const shown = this.#shown;
-      if (!shown || ["id", "seed"].some((key) => shown[key] !== episode[key])) return;
+    worker.addEventListener("message", ({ data: { asked, name, state, isOver } }) => {
+      if (asked !== this.#asked) return;
       this.scores.push([name, scoreOf(state) + (isOver ? "" : "+")]);
       this.#write();
     });
@@ -45,10 +46,6 @@ export class Answer {
 
   #write() {
     if (this.scores.length > 1) this.say(`${this.scores.map((score) => score.join(" ")).join(", ")}.`);
-    $("scores").replaceChildren(...this.scores.map(([name, score]) => {
-      const item = Object.assign(document.createElement("span"), { textContent: `${name} ` });
-      item.append(Object.assign(document.createElement("b"), { textContent: score }));
-      return item;
-    }));
+    $("scores").replaceChildren(...this.scores.map(([name, score]) => make("span", {}, `${name} `, make("b", {}, score))));
   }
 }

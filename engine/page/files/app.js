@@ -1,5 +1,6 @@
 // The page: connects the engine, the episode, the wall, and the address.
 
+import { $, make } from "./dom.js";
 import { Engine } from "./engine.js";
 import { ParameterForm } from "./form.js";
 import { isTyping } from "./keys.js";
@@ -7,8 +8,6 @@ import { episodeLink, randomSeed, readLink, wallLink } from "./link.js";
 import { Play } from "./play.js";
 import { questionOf } from "./tasks.js";
 import { Wall } from "./wall.js";
-
-const $ = (id) => document.getElementById(id);
 
 /** Says something beside the control that it is about, over the page; an empty text takes it away. */
 function say(text, near = "pause", isNote = false) {
@@ -30,8 +29,8 @@ const report = (error) => say(error.message);
 /** Most bytes of an opened file; more do not fit into the engine's memory. */
 const LARGEST = 1e9;
 
-/** The environments of a page without a link; the first that an agent of the page plays. */
-const LANDING = ["Endless-MortarMayhem-v0", "MortarMayhem-Grid-v0"];
+/** The environment of a page without a link, which an agent plays until the visitor starts. */
+const LANDING = "Endless-MortarMayhem-v0";
 
 /** The wall that the page shows unless the address names another. */
 const WALL = { wall: "all", count: "100", by: "expert" };
@@ -42,17 +41,16 @@ class App {
     this.specs = engine.request("specs");
     this.form = new ParameterForm($("fields"), (options) => engine.request({ check: { id: $("environment").value, options } }));
     this.play = new Play(engine, this.specs, { changed: (state) => this.#playing(state), report });
-    const landing = LANDING.find((id) => this.play.agents.has(id) && this.specs.some((spec) => spec.id === id));
-    this.first = landing ?? this.specs[0].id;
+    this.hasLanding = this.specs.some((spec) => spec.id === LANDING);
+    this.first = this.hasLanding ? LANDING : this.specs[0].id;
     $("source").hidden = this.specs.every((spec) => questionOf(spec.id) === "");
-    this.hasLanding = Boolean(landing);
     this.wall = new Wall(engine, this.specs, {
       changed: (wall) => this.#address(wallLink(wall)),
       play: (episode) => this.start(episode),
       report: (error) => this.#noWall(error),
     });
-    this.#environments();
-    $("to-wall").disabled = this.specs.every((spec) => !spec.shown);
+    $("environment").append(...this.specs.map(({ id }) => new Option(id)));
+    $("to-wall").parentElement.hidden = this.specs.every((spec) => !spec.shown);
     $("agent").hidden = this.specs.every((spec) => !this.play.agents.has(spec.id));
     this.#listen();
   }
@@ -99,20 +97,15 @@ class App {
     else this.wall.start(link);
   }
 
-  /** Says why there is no wall, and shows another one if there is none. */
+  /** Says why there is no wall, and plays the environment alone. */
   #noWall(error) {
-    if (!this.wall.state) this.showWall(WALL);
+    if (!this.wall.state) this.start({ id: $("environment").value, options: {}, seed: randomSeed() });
     say(error.message, "environment");
-  }
-
-  #environments() {
-    const option = (id) => Object.assign(document.createElement("option"), { value: id, textContent: id });
-    $("environment").replaceChildren(...this.specs.map((spec) => option(spec.id)));
   }
 
   #allOption(wanted) {
     const all = $("environment").querySelector("[value=all]");
-    if (wanted && !all) $("environment").prepend(Object.assign(document.createElement("option"), { value: "all", textContent: "All" }));
+    if (wanted && !all) $("environment").prepend(new Option("All", "all"));
     if (!wanted) all?.remove();
   }
 
@@ -195,7 +188,7 @@ class App {
   #giveKeysBack() {
     const give = () => this.play.active && $("observation").focus({ preventScroll: true });
     addEventListener("click", ({ target, detail }) => {
-      if (target.closest("#play, header") && (detail > 0 || target.closest("button")) && !isTyping(target) && !target.matches("select, label")) give();
+      if (target.closest("#play > :not(#hands), header") && (detail > 0 || target.closest("button")) && !isTyping(target) && !target.matches("select, label")) give();
     });
     // An arrow that changes a control keeps the keys there.
     addEventListener("change", ({ target }) => target.matches("select:not(:focus-visible)") && give());
@@ -216,7 +209,7 @@ class App {
   #save() {
     const { bytes, name } = this.play.recording();
     const url = URL.createObjectURL(new Blob([bytes], { type: "application/gzip" }));
-    Object.assign(document.createElement("a"), { href: url, download: name }).click();
+    make("a", { href: url, download: name }).click();
     setTimeout(() => URL.revokeObjectURL(url), 10_000);
     say(`Saved as ${name}; \`endless verify ${name}\` replays it.`, "save", true);
   }
@@ -282,8 +275,6 @@ try {
   globalThis.endless = app;
   app.follow();
   $("play").ariaBusy = "false";
-  // For measurements: milliseconds from the start of navigation to the frame after the first picture.
-  requestAnimationFrame((now) => (app.firstFrame = now));
 } catch (error) {
   $("overlay").hidden = true;
   say(globalThis.WebAssembly ? error.message : "This page needs WebAssembly, which this browser lacks or has switched off.");

@@ -1,5 +1,7 @@
 // The reset parameters as a form, made from the engine's table.
 
+import { make } from "./dom.js";
+
 /** The groups of the parameters, each with a pattern of their names; the first that matches counts. */
 const GROUPS = [
   ["Rewards", /^reward_/],
@@ -29,11 +31,7 @@ export class ParameterForm {
       groups.get(name).push(this.#field(parameter, options[parameter.name]));
     }
     const shown = [...groups].filter(([, fields]) => fields.length > 0);
-    this.place.replaceChildren(...shown.map(([name, fields]) => {
-      const group = document.createElement("fieldset");
-      group.append(Object.assign(document.createElement("legend"), { textContent: name }), ...fields);
-      return group;
-    }));
+    this.place.replaceChildren(...shown.map(([name, fields]) => make("fieldset", {}, make("legend", {}, name), ...fields)));
     this.validate();
   }
 
@@ -68,35 +66,16 @@ export class ParameterForm {
   }
 
   #field(parameter, text) {
-    const field = document.createElement("div");
-    field.className = "field";
-    const id = `parameter-${parameter.name}`;
-    const label = document.createElement("label");
-    label.htmlFor = id;
-    label.textContent = parameter.name;
-    const input = document.createElement("input");
-    input.id = id;
-    input.name = parameter.name;
-    input.autocomplete = "off";
-    input.spellcheck = false;
-    if (parameter.type === "bool") {
-      input.type = "checkbox";
-      input.checked = (text ?? parameter.default_text) === "true";
-    } else {
-      input.value = text ?? parameter.default_text;
-      if (parameter.type !== "int_list") input.inputMode = "decimal";
-    }
-    const hint = document.createElement("p");
-    hint.className = "hint";
-    hint.id = `${id}-hint`;
-    hint.textContent = `${parameter.description} Default ${parameter.default_text}; ${parameter.allowed}.`;
-    const error = document.createElement("p");
-    error.className = "error";
-    error.id = `${id}-error`;
+    const { name, type, description, default_text: initial, allowed } = parameter;
+    const id = `parameter-${name}`;
+    const input = make("input", { id, name, autocomplete: "off", spellcheck: false });
+    if (type === "bool") Object.assign(input, { type: "checkbox", checked: (text ?? initial) === "true" });
+    else Object.assign(input, { value: text ?? initial, inputMode: type === "int_list" ? "" : "decimal" });
+    const hint = make("p", { className: "hint", id: `${id}-hint` }, `${description} Default ${initial}; ${allowed}.`);
+    const error = make("p", { className: "error", id: `${id}-error` });
     input.setAttribute("aria-describedby", `${hint.id} ${error.id}`);
     input.addEventListener("input", () => this.validate());
-    field.append(label, input, hint, error);
-    this.#fields.set(parameter.name, { parameter, input, error });
-    return field;
+    this.#fields.set(name, { parameter, input, error });
+    return make("div", { className: "field" }, make("label", { htmlFor: id }, name), input, hint, error);
   }
 }

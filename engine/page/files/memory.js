@@ -1,8 +1,7 @@
 // What a player should remember at this step: commands, the tiles of a path, or places; and how well the agent does.
 
+import { $, make } from "./dom.js";
 import { arrowOf, outcomeOf, unitOf } from "./tasks.js";
-
-const $ = (id) => document.getElementById(id);
 
 /** Columns of a long path that are shown. */
 const COLUMNS = 16;
@@ -28,25 +27,19 @@ function commandList(state) {
     if (place > done || outcome === "success") return "later";
     return outcome ? "failed" : "next";
   };
-  const list = Object.assign(document.createElement("ol"), { className: "commands" });
-  list.append(...commands.map((command, place) => {
-    const item = Object.assign(document.createElement("li"), { className: kind(place) });
-    const went = item.className === "done" ? command : carried[place];
-    const said = { done: "✓", failed: went ? "✕ went" : "✕ failed", next: "next", later: "" }[item.className];
-    item.append(
-      element("b", arrowOf(command), true),
-      element("span", command),
-      element("small", said),
-      element("i", went && went !== command ? arrowOf(went) ?? "?" : "", true),
-      element("span", went && went !== command ? went : "", false, "visually-hidden"),
+  const items = commands.map((command, place) => {
+    const className = kind(place);
+    const went = className === "done" || carried[place] === command ? "" : carried[place] ?? "";
+    const said = { done: "✓", failed: carried[place] ? "✕ went" : "✕ failed", next: "next", later: "" }[className];
+    return make("li", { className },
+      make("b", { ariaHidden: "true" }, arrowOf(command)),
+      make("span", {}, command),
+      make("small", {}, said),
+      make("i", { ariaHidden: "true" }, went && (arrowOf(went) ?? "?")),
+      make("span", { className: "visually-hidden" }, went),
     );
-    return item;
-  }));
-  return list;
-}
-
-function element(kind, textContent, ariaHidden = false, className = "") {
-  return Object.assign(document.createElement(kind), { textContent, className, ...(ariaHidden ? { ariaHidden: "true" } : {}) });
+  });
+  return make("ol", { className: "commands" }, ...items);
 }
 
 /** The tiles that were walked, and the falls beside them. */
@@ -70,13 +63,13 @@ function places(coins, exit) {
 }
 
 function picture(viewBox, label, shapes) {
-  const make = (kind, attributes) => {
+  const shape = (kind, attributes) => {
     const made = document.createElementNS("http://www.w3.org/2000/svg", kind);
     for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
     return made;
   };
-  const svg = make("svg", { viewBox, role: "img", "aria-label": label, class: "map" });
-  svg.append(...shapes.map(([kind, name, attributes]) => make(kind, { class: name, ...attributes })));
+  const svg = shape("svg", { viewBox, role: "img", "aria-label": label, class: "map" });
+  svg.append(...shapes.map(([kind, name, attributes]) => shape(kind, { class: name, ...attributes })));
   return svg;
 }
 

@@ -3,6 +3,7 @@
 import { Agents } from "./agents.js";
 import { Answer } from "./answer.js";
 import { ActionControls } from "./controls.js";
+import { $, disable, make } from "./dom.js";
 import { flash } from "./flash.js";
 import { Directions, isTyping } from "./keys.js";
 import { randomSeed } from "./link.js";
@@ -11,9 +12,7 @@ import { showMemory } from "./memory.js";
 import { Pace } from "./pace.js";
 import { Rival } from "./rival.js";
 import { enable, tone } from "./sound.js";
-import { actionFor, actionText, choiceName, commandsOf, legendOf, outcomeOf, questionOf, scoreNumber, steering, TASKS, waits } from "./tasks.js";
-
-const $ = (id) => document.getElementById(id);
+import { actionFor, actionText, choiceName, commandsOf, isTurnBased, legendOf, outcomeOf, questionOf, scoreNumber, steering, TASKS, waits } from "./tasks.js";
 
 const PAD = [["left up", "↖"], ["up", "↑"], ["right up", "↗"], ["left", "←"], null, ["right", "→"], ["left down", "↙"], ["down", "↓"], ["right down", "↘"]];
 
@@ -43,9 +42,9 @@ export class Play {
     this.agents = new Agents(engine);
     this.answer = new Answer(engine, this.agents, (text) => this.say(text));
     this.rival = new Rival(engine, this.agents);
-    this.directions = new Directions(() => this.#takeOver());
+    this.directions = new Directions(() => this.#takeOver(() => this.play()));
     this.directions.attach($("pad"));
-    this.controls = new ActionControls($("action"));
+    this.controls = new ActionControls($("action"), () => this.#takeOver(() => this.oneStep()));
     this.pace = new Pace(25, (count) => this.#steps(count));
     this.active = true;
     this.#listen();
@@ -98,8 +97,9 @@ export class Play {
     if (!this.state || player === this.player) return;
     // A recording may have no seed.
     const episode = { ...this.state, options: this.before ?? this.state.options, seed: this.state.seed ?? "0" };
-    if (player === "agent") return this.agents.has(episode.id) ? this.playAgent(episode) : undefined;
-    if (player === "expert") return this.spec.has_expert ? this.#attempt(() => this.start(episode, "expert")) : undefined;
+    if (player === "agent") return this.playAgent(episode);
+    if (player === "expert" && !this.spec.has_expert) return this.report(new Error(this.#noExpert()));
+    if (player === "expert") return this.#attempt(() => this.start(episode, "expert"));
     if (this.before) return this.#attempt(() => this.start(episode));
     this.player = "person";
     this.changed(this.state);
@@ -208,7 +208,8 @@ export class Play {
     return this.player === "trace" ? this.state.recording.over : this.state.done;
   }
 
-  #takeOver() {
+  /** Continues the episode by `go`, as a person. */
+  #takeOver(go) {
     if (!this.active || !this.state) return;
     if (this.isDemo) return this.#startOwn();
     if (this.state.done) return;
@@ -216,7 +217,7 @@ export class Play {
       this.player = "person";
       this.changed(this.state);
     }
-    this.play();
+    go();
   }
 
   #steps(count, single = false) {
@@ -285,11 +286,12 @@ export class Play {
     $("words").textContent = words;
     const running = this.pace.running;
     $("pause").textContent = this.isDemo ? "Play" : this.#over() ? "New episode" : running ? "Pause" : state.length === 0 ? "Start" : "Continue";
-    $("step").disabled = this.#over();
+    // The text on the picture says why.
+    $("step").ariaDisabled = String(this.#over());
     document.body.classList.toggle("demo", this.isDemo);
     this.rival.follow(state, spec);
     this.answer.show(this.player === "person" && state.done ? state : null);
-    $("expert").disabled = !spec.has_expert;
+    disable("expert", this.#noExpert());
     for (const player of ["person", "expert", "agent"]) $(player).setAttribute("aria-pressed", String(this.player === player));
     this.#agent();
     $("truth").classList.toggle("covered", this.player === "person" && !this.#over() && !$("show-truth").checked);
@@ -299,15 +301,20 @@ export class Play {
     $("said").textContent = text;
     $("choices").hidden = !this.#over() || this.isDemo;
     // On the picture then; their places stay, so that nothing moves.
-    for (const id of ["restart", "next"]) $(id).style.visibility = this.#over() && !this.isDemo ? "hidden" : "";
+    const hide = (id, isHidden) => ($(id).style.visibility = isHidden && !this.isDemo ? "hidden" : "");
+    for (const id of ["restart", "next"]) hide(id, this.#over());
+    // Each choice plays a step.
+    hide("pause", isTurnBased(spec) && this.player === "person" && !this.#over());
+  }
+
+  /** Why no expert can play, or an empty string. */
+  #noExpert() {
+    return this.spec.has_expert ? "" : `${this.spec.id} has no scripted expert.`;
   }
 
   #agent() {
     const { player, state } = this;
-    const reason = this.agents.reason(state.id);
-    // Not `disabled`, so that the keyboard still reaches the button and a screen reader reads the reason.
-    $("agent").setAttribute("aria-disabled", String(reason !== ""));
-    $("agent-reason").textContent = $("agent").hidden ? "" : reason;
+    disable("agent", $("agent").hidden ? "" : this.agents.reason(state.id));
     // Shown before the agent plays, too, so that nothing moves when it does.
     $("memory").hidden = state.clues === null;
     if (state.clues) showMemory(state, this.agents, player === "person");
@@ -330,6 +337,7 @@ export class Play {
       return `${success}: return ${round(state.return)} in ${state.length} steps.`;
     }
     if (this.#over()) return "The recording ends here.";
+    if (this.player === "person" && isTurnBased(this.spec)) return state.length === 0 ? "Choose an action." : "";
     if (state.length === 0 && !this.pace.running) {
       if (this.player === "trace") return `${GO} replays the recording.`;
       if (Object.keys(steering(this.spec)).length === 0) return `${GO} starts.`;
@@ -339,8 +347,8 @@ export class Play {
   }
 
   #legend() {
-    $("legend").replaceChildren(...legendOf(this.state.id).map(([color, textContent]) => {
-      const item = Object.assign(document.createElement("li"), { textContent });
+    $("legend").replaceChildren(...legendOf(this.state.id).map(([color, meaning]) => {
+      const item = make("li", {}, meaning);
       item.style.setProperty("--color", color);
       return item;
     }));
@@ -353,12 +361,13 @@ export class Play {
     $("pad").replaceChildren(...PAD.map((entry) => {
       const branches = entry?.[0].split(" ").map((direction) => meaning[direction]?.[0]) ?? [];
       // Two directions need two branches.
-      if (!entry || branches.includes(undefined) || new Set(branches).size < branches.length) return document.createElement("span");
+      if (!entry || branches.includes(undefined) || new Set(branches).size < branches.length) return make("span");
       const [directions, sign] = entry;
-      const button = Object.assign(document.createElement("button"), { type: "button", textContent: signs[directions] ?? sign, ariaLabel: directions });
+      const button = make("button", { type: "button", ariaLabel: directions }, signs[directions] ?? sign);
       button.dataset.directions = directions;
       return button;
     }));
+    $("pad").hidden = Object.keys(meaning).length === 0;
   }
 
   #listen() {
@@ -403,10 +412,8 @@ function showNumbers(list, rows) {
   if (list.dataset.names !== names) {
     list.dataset.names = names;
     list.replaceChildren(...rows.map(({ name, of }) => {
-      const [item, number] = [document.createElement("div"), document.createElement("dd")];
-      number.append("", ...(of == null ? [] : [Object.assign(document.createElement("progress"), { ariaLabel: name })]));
-      item.append(Object.assign(document.createElement("dt"), { textContent: name }), number);
-      return item;
+      const number = make("dd", {}, "", ...(of == null ? [] : [make("progress", { ariaLabel: name })]));
+      return make("div", {}, make("dt", {}, name), number);
     }));
   }
   rows.forEach(({ value, of, text }, index) => {

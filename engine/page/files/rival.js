@@ -1,9 +1,8 @@
 // An agent without memory, which plays the same episode beside the one with memory.
 
+import { $ } from "./dom.js";
 import { Engine } from "./engine.js";
 import { scoreOf, unitOf } from "./tasks.js";
-
-const $ = (id) => document.getElementById(id);
 
 export class Rival {
   #engine = null;

@@ -11,7 +11,7 @@ let last = null;
 
 addEventListener("message", async ({ data }) => {
   last = data;
-  const { module, files, episode } = data;
+  const { asked, module, files, episode } = data;
   for (const file of files) {
     const [engine, response] = await Promise.all([Engine.of(module), fetch(new URL(`${file}.safetensors`, import.meta.url))]);
     if (!response.ok) continue;
@@ -23,6 +23,6 @@ addEventListener("message", async ({ data }) => {
       // Lets the next task arrive.
       await new Promise((done) => setTimeout(done));
     }
-    if (last === data) postMessage({ episode, state, name: title.replace(/^An? (agent )?/, ""), isOver: state.done });
+    if (last === data) postMessage({ asked, state, name: title.replace(/^An? (agent )?/, ""), isOver: state.done });
   }
 });

@@ -3,6 +3,9 @@
 const MORTAR = "Remember the commands, shown one by one: an arrow means a neighbouring tile, a crossed circle stay.";
 const GRID = "Left and right turn, up walks ahead.";
 
+/** The entry of the first key that is a part of the id. */
+const ofId = (table, id) => Object.entries(table).find(([part]) => id.includes(part))?.[1];
+
 /** What an environment asks of a player, by a part of its id. */
 const QUESTIONS = {
   MortarMayhemB: "Can you follow the commands?",
@@ -13,7 +16,7 @@ const QUESTIONS = {
 
 /** The question of an environment; empty for others than those of Memory Gym. */
 export function questionOf(id) {
-  return Object.entries(QUESTIONS).find(([name]) => id.includes(name))?.[1] ?? "";
+  return ofId(QUESTIONS, id) ?? "";
 }
 
 /** Two sentences for each id. */
@@ -42,22 +45,18 @@ export const TASKS = {
     "Collect one coin after the other; each is visible for a moment only. Spotlights cost health, and time runs out without a coin.",
 };
 
-const MORTAR_COLORS = [["#00ff00", "ring: the tile to be on"], ["#701824", "burning tiles"]];
-const PATH_COLORS = [["#ffffff", "the path"], ["#0000ff", "start"], ["#00ff00", "goal"], ["#ff0000", "walls beside it"]];
-
-/** What the colours of an environment's ground-truth view mean, by the start of its id. */
+/** What the colours of an environment's ground-truth view mean, by a part of its id; the first that matches counts. */
 const COLORS = {
-  MortarMayhem: MORTAR_COLORS,
-  "Endless-MortarMayhem": MORTAR_COLORS,
-  MysteryPath: PATH_COLORS,
+  MortarMayhem: [["#00ff00", "ring: the tile to be on"], ["#701824", "burning tiles"]],
   "Endless-MysteryPath": [["#c8c8c8", "the path"], ["#00ff00", "stamina"], ["#ff0000", "spent stamina"]],
-  SearingSpotlights: [["#ffa500", "coins"], ["#373737", "closed exit"], ["#308d46", "open exit"], ["#00ff00", "health"]],
+  MysteryPath: [["#ffffff", "the path"], ["#0000ff", "start"], ["#00ff00", "goal"], ["#ff0000", "walls beside it"]],
   "Endless-SearingSpotlights": [["#ffa500", "coin"], ["#00ff00", "health"]],
+  SearingSpotlights: [["#ffa500", "coins"], ["#373737", "closed exit"], ["#308d46", "open exit"], ["#00ff00", "health"]],
 };
 
 /** Pairs of a colour and its meaning; none where the environment's own view is unknown. */
 export function legendOf(id) {
-  return Object.entries(COLORS).find(([name]) => id.startsWith(name))?.[1] ?? [];
+  return ofId(COLORS, id) ?? [];
 }
 
 const DIRECTION_NAMES = { left: ["left"], right: ["right"], up: ["up", "ahead"], down: ["down"] };
@@ -96,9 +95,14 @@ export function actionFor(spec, directions, given) {
   return action;
 }
 
-/** Whether every choice is a direction, so that a person who presses none does not act. */
+/** Whether no choice is a direction, so that each one plays a step. */
+export function isTurnBased(spec) {
+  return !spec.action_space.Box && Object.keys(steering(spec)).length === 0;
+}
+
+/** Whether a person who chooses nothing does not act. */
 export function waits(spec) {
-  return Object.values(steering(spec)).some(([, number]) => number === 0);
+  return isTurnBased(spec) || Object.values(steering(spec)).some(([, number]) => number === 0);
 }
 
 /** An action in a few signs and words. */

@@ -18,23 +18,24 @@ const pace = new Pace(25, (count) => {
     do state = engine.stepWall(1);
     while (++step < count && performance.now() - start < BUDGET);
     since.steps += step;
+    since.pictures += 1;
     draw();
   } catch (error) {
     return fail(error);
   }
   const seconds = (performance.now() - since.time) / 1000;
   // The first steps, in which experts plan, tell nothing about the rest.
-  if (seconds * 1000 >= INTERVAL) report(since.isFirst ? null : since.steps / seconds);
+  if (seconds * 1000 >= INTERVAL) report(since.isFirst ? null : since.steps / seconds, since.pictures / seconds);
 });
 
 function draw() {
   canvas.getContext("2d").putImageData(engine.wall(state.width, state.height), 0, 0);
 }
 
-/** Tells the page the state, and how often each environment stepped per second. */
-function report(rate, isFirst = false) {
-  since = { time: performance.now(), steps: 0, isFirst };
-  postMessage({ state, rate });
+/** Tells the page the state, and how often a second each environment stepped and the wall was drawn. */
+function report(rate, pictures, isFirst = false) {
+  since = { time: performance.now(), steps: 0, pictures: 0, isFirst };
+  postMessage({ state, rate, pictures });
 }
 
 function fail(error) {
@@ -50,11 +51,11 @@ const TASKS = {
     state = engine.request({ wall: request });
     Object.assign(canvas, { width: state.width, height: state.height });
     draw();
-    report(null, true);
+    report(null, null, true);
     pace.start();
   },
   run({ running }) {
-    since = { time: performance.now(), steps: 0, isFirst: true };
+    since = { time: performance.now(), steps: 0, pictures: 0, isFirst: true };
     if (running) pace.start();
     else pace.stop();
   },

@@ -1,8 +1,7 @@
 // Many self-playing environments on one canvas, which a worker steps and draws.
 
+import { $, make } from "./dom.js";
 import { live } from "./live.js";
-
-const $ = (id) => document.getElementById(id);
 
 export class Wall {
   #worker = null;
@@ -10,8 +9,9 @@ export class Wall {
   /** Whether the browser has what a wall needs. */
   static works = "transferControlToOffscreen" in HTMLCanvasElement.prototype;
 
-  /** Steps of each environment per second; null before the first report. */
+  /** How often a second each environment steps, and the wall is drawn; null before the first report. */
   rate = null;
+  pictures = null;
 
   /** The place of the environment that the keyboard has chosen. */
   #place = 0;
@@ -43,7 +43,8 @@ export class Wall {
     const hasExpert = this.specs.some((spec) => ids.includes(spec.id) && spec.has_expert);
     const expert = by !== "random" && hasExpert;
     $("wall-count").value = String(number);
-    $("wall-by").disabled = !hasExpert;
+    // Without an expert, there is nothing to choose from.
+    $("wall-by").parentElement.hidden = !hasExpert;
     $("wall-by").value = expert ? "expert" : "random";
     const groups = ids.map((id) => ({ id, num_envs: Math.max(1, Math.floor(number / ids.length)), options }));
     this.state = null;
@@ -83,7 +84,7 @@ export class Wall {
     this.#worker.postMessage({ task, ...data });
   }
 
-  #receive({ error, tile, state, rate }) {
+  #receive({ error, tile, state, rate, pictures }) {
     if (error) {
       this.#running(false);
       this.link = null;
@@ -101,18 +102,15 @@ export class Wall {
     }
     this.#table();
     if (rate === null) return;
-    this.rate = rate;
+    [this.rate, this.pictures] = [rate, pictures];
     if ($("chosen").hidden) this.say(`${Math.round(rate * this.#count()).toLocaleString("en")} steps per second.`);
   }
 
   #table() {
     const number = (value) => (value === null ? "–" : value.toFixed(2));
     $("wall-table").replaceChildren(...this.state.groups.map((group) => {
-      const row = document.createElement("tr");
-      const cells = [group.id, group.episodes, number(group.mean_return), number(group.mean_length)];
-      row.append(...cells.map((textContent, index) => Object.assign(document.createElement(index === 0 ? "th" : "td"), { textContent })));
-      row.firstChild.scope = "row";
-      return row;
+      const cells = [group.episodes, number(group.mean_return), number(group.mean_length)];
+      return make("tr", {}, make("th", { scope: "row" }, group.id), ...cells.map((cell) => make("td", {}, cell)));
     }));
   }
 
@@ -124,7 +122,7 @@ export class Wall {
   #names() {
     let place = 0;
     $("wall-names").replaceChildren(...this.state.groups.map(({ id, num_envs: number }) => {
-      const name = Object.assign(document.createElement("span"), { textContent: id });
+      const name = make("span", {}, id);
       this.#put(name, place, Math.min(number, this.state.columns - (place % this.state.columns)));
       place += number;
       return name;

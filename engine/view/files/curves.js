@@ -1,5 +1,6 @@
 // Curves of an engine's statistics over time.
 
+import { make } from "./dom.js";
 import { duration, grouped, short } from "./numbers.js";
 
 const CURVES = [
@@ -19,7 +20,7 @@ export class Curves {
   constructor(parent) {
     this.points = [];
     this.shown = CURVES.map(([key, title, text]) => {
-      const figure = document.createElement("figure");
+      const figure = make("figure");
       figure.innerHTML = `<figcaption><span></span><b></b></figcaption>
         <svg viewBox="0 0 ${WIDTH} ${HEIGHT}" preserveAspectRatio="none" role="img"><path></path></svg>
         <small><span class="from"></span><span class="limits"></span><span class="to"></span></small>`;

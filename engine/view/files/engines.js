@@ -1,5 +1,6 @@
 // The running engines.
 
+import { make } from "./dom.js";
 import { grouped, processes } from "./numbers.js";
 
 /** The server's list of running engines. */
@@ -33,19 +34,9 @@ export class Table {
   #row(engine) {
     const [first, last] = [0, -1].map((place) => this.counts.get(engine.incarnation).at(place));
     const rate = first === last ? null : ((last.steps - first.steps) / (last.now - first.now)) * 1000;
-    const row = document.createElement("tr");
-    const button = document.createElement("button");
-    button.type = "button";
-    button.textContent = engine.service;
+    const button = make("button", { type: "button" }, engine.service);
     button.addEventListener("click", () => this.choose(engine.service));
     const cells = [engine.id, `${engine.groups} × ${engine.num_envs}`, grouped(rate), grouped(engine.episodes), processes(engine.trainers)];
-    row.append(cell(button), ...cells.map((text) => cell(text)));
-    return row;
+    return make("tr", {}, ...[button, ...cells].map((cell) => make("td", {}, cell)));
   }
-}
-
-function cell(content) {
-  const made = document.createElement("td");
-  made.append(content);
-  return made;
 }

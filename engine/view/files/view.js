@@ -1,11 +1,11 @@
 // The page: selects an engine, and shows what the server says about it.
 
 import { Curves } from "./curves.js";
+import { $, make } from "./dom.js";
 import { Table, engines } from "./engines.js";
 import { decode, frameBytes, paint } from "./frames.js";
 import { duration, grouped, megabytes, processes, short } from "./numbers.js";
 
-const $ = (id) => document.getElementById(id);
 const RETRY = 1000;
 
 /** Seconds after a request for which an engine counts as used, although its list of trainers may be older than the trainer. */
@@ -81,7 +81,7 @@ class View {
     const options = [["", "All engines"], ...names.map((name) => [name, name])];
     const known = [...$("engine").options].map((option) => option.value).join("\n");
     if (known !== options.map(([value]) => value).join("\n")) {
-      $("engine").replaceChildren(...options.map(([value, textContent]) => Object.assign(document.createElement("option"), { value, textContent })));
+      $("engine").replaceChildren(...options.map(([value, text]) => new Option(text, value)));
     }
     $("engine").value = this.service ?? "";
     this.table.show(answer.engines);
@@ -171,22 +171,15 @@ class View {
       ["Last request", (status.seconds_since_request ?? null) === null ? "none" : ago(status.seconds_since_request)],
       ["Started", status.uptime_seconds === undefined ? "–" : ago(status.uptime_seconds)],
     ];
-    const rows = values.map(([term, value]) => {
-      const row = document.createElement("div");
-      row.append(Object.assign(document.createElement("dt"), { textContent: term }), Object.assign(document.createElement("dd"), { textContent: value }));
-      return row;
-    });
-    $("numbers").replaceChildren(...rows);
+    $("numbers").replaceChildren(...values.map(([term, value]) => make("div", {}, make("dt", {}, term), make("dd", {}, value))));
   }
 
   /** Updates the controls for another engine. */
   #layout(about) {
     this.group = Math.min(this.group, about.groups - 1);
     this.first = Math.min(this.first, about.num_envs - 1);
-    const groups = Array.from({ length: about.groups }, (_, group) => Object.assign(document.createElement("option"), { textContent: group }));
-    $("group").replaceChildren(...groups);
+    $("group").replaceChildren(...Array.from({ length: about.groups }, (_, group) => new Option(group)));
     $("group").value = this.group;
-    $("group").disabled = about.groups === 1;
     this.#select();
   }
 
@@ -197,8 +190,9 @@ class View {
     let envs = Array.from({ length: count }, (_, i) => this.first + i).filter((env) => env < most);
     if (this.about) {
       $("range").textContent = `${grouped(this.first)} to ${grouped(envs.at(-1))} of ${grouped(most)}`;
-      $("before").disabled = this.first === 0;
-      $("after").disabled = this.first + count >= most;
+      // Not `disabled`, which would take the focus from a button that was pressed; the range says why.
+      $("before").ariaDisabled = String(this.first === 0);
+      $("after").ariaDisabled = String(this.first + count >= most);
     }
     if (this.large !== null && !envs.includes(this.large)) envs.push(this.large);
     // A page in the background needs no frames.
@@ -232,9 +226,7 @@ class View {
   }
 
   #place() {
-    const button = document.createElement("button");
-    button.type = "button";
-    button.append(document.createElement("canvas"), document.createElement("span"));
+    const button = make("button", { type: "button" }, make("canvas"), make("span"));
     button.addEventListener("click", () => this.enlarge(Number(button.dataset.env)));
     return button;
   }
@@ -250,11 +242,7 @@ class View {
   }
 
   #rows({ envs, features }) {
-    const row = (kind, texts) => {
-      const made = document.createElement("tr");
-      made.append(...texts.map((textContent) => Object.assign(document.createElement(kind), { textContent })));
-      return made;
-    };
+    const row = (kind, texts) => make("tr", {}, ...texts.map((text) => make(kind, {}, text)));
     $("columns").replaceChildren(row("th", ["environment", "step", "reward", "return", ...features]));
     $("values").replaceChildren(...envs.map((each) => row("td", [each.env, each.length, short(each.reward, 2), short(each.return, 2), ...each.features.map((number) => short(number, 2))])));
   }
@@ -270,7 +258,7 @@ class View {
     $("group").addEventListener("change", () => move(() => (this.group = Number($("group").value))));
     $("count").addEventListener("change", () => move((count) => (this.first -= this.first % count)));
     $("before").addEventListener("click", () => move((count) => (this.first = Math.max(0, this.first - count))));
-    $("after").addEventListener("click", () => move((count) => (this.first += count)));
+    $("after").addEventListener("click", () => move((count) => (this.first += this.first + count < this.about?.num_envs ? count : 0)));
     $("smaller").addEventListener("click", () => this.enlarge(null));
     $("theme").addEventListener("click", () => {
       const root = document.documentElement;

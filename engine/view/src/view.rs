@@ -25,7 +25,7 @@ use crate::channel::{Channel, Connected};
 use crate::engines;
 use crate::watcher;
 
-/// The page's own files. It shares style and icon with the page that plays the environments.
+/// The page's own files. It shares others with the page that plays the environments.
 const FILES: [(&str, &[u8]); 6] = [
     ("view.css", include_bytes!("../files/view.css")),
     ("view.js", include_bytes!("../files/view.js")),
@@ -162,7 +162,7 @@ async fn index(State(shared): State<Arc<Shared>>) -> Response {
 
 async fn file(headers: HeaderMap, address: Uri) -> Response {
     let name = address.path().rsplit('/').next().unwrap_or_default();
-    if let "style.css" | "icon.svg" = name
+    if let "style.css" | "icon.svg" | "dom.js" = name
         && let Some(bytes) = endless_gym_page::file(name)
     {
         return server::compressed(&headers, name, bytes);

@@ -106,8 +106,8 @@ fn the_page_tells_what_it_waits_for_and_what_it_lacks() {
     browser.load(&server.url());
     browser.wait("!document.getElementById('message').hidden");
     assert_eq!(browser.value("document.getElementById('overlay').hidden"), true);
-    let said = browser.value("document.getElementById('message').textContent");
-    assert!(said.as_str().unwrap().starts_with("The engine cannot be loaded ("), "{said}");
+    let said = crate::text(&mut browser, "message");
+    assert!(said.starts_with("The engine cannot be loaded ("), "{said}");
     browser.call("Network.setBlockedURLs", &json!({"urls": []}));
     // Without parts of the browser.
     for (lack, link, message) in [

@@ -7,9 +7,10 @@ use serde_json::{Value as Json, json};
 
 use crate::chromium::Chromium;
 use crate::server::PageServer;
-use crate::{STATE, start, visit};
+use crate::{STATE, start, text, visit};
 
 const ID: &str = "MortarMayhem-Grid-v0";
+
 /// The environments with a trained agent, those of the page's files.
 fn with_agent() -> Vec<String> {
     let files = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../engine/page/files")).unwrap();
@@ -18,10 +19,6 @@ fn with_agent() -> Vec<String> {
     ids.retain(|id| !id.ends_with("-none"));
     ids.sort();
     ids
-}
-
-fn text(browser: &mut Chromium, id: &str) -> String {
-    browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
 }
 
 fn clues(browser: &mut Chromium) -> Vec<String> {

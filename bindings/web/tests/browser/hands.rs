@@ -4,7 +4,7 @@ use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 
 use crate::server::PageServer;
-use crate::{STATE, start, visit};
+use crate::{STATE, start, text, visit};
 
 const LENGTH: &str = "endless.play.state.length";
 
@@ -288,11 +288,8 @@ fn a_file_that_is_too_large_is_named_so() {
     browser.choose("#file", &path);
     browser.wait("!document.getElementById('message').hidden");
     std::fs::remove_file(path).unwrap();
-    let said = browser.value("document.getElementById('message').textContent");
-    assert!(
-        said.as_str().unwrap().ends_with(": the file has 3.0 GB; recordings and agents have at most 1 GB"),
-        "{said}"
-    );
+    let said = text(&mut browser, "message");
+    assert!(said.ends_with(": the file has 3.0 GB; recordings and agents have at most 1 GB"), "{said}");
 }
 
 /// The page's frames and the wall's steps per second, over some milliseconds.

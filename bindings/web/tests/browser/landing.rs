@@ -3,16 +3,11 @@
 use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 
-use crate::chromium::Chromium;
 use crate::server::PageServer;
-use crate::{STATE, start, visit};
+use crate::{STATE, start, text, visit};
 
 const DEMO: &str = "endless.play.isDemo && endless.play.player === 'agent'";
 const TO_THE_END: &str = "endless.play.stop(); while (!endless.play.state.done) endless.play.oneStep()";
-
-fn text(browser: &mut Chromium, id: &str) -> String {
-    browser.value(&format!("document.getElementById('{id}').innerText")).as_str().unwrap().to_owned()
-}
 
 #[test]
 #[ignore = "needs the built page and Chromium"]
@@ -95,6 +90,28 @@ fn the_answer_is_what_the_agents_reach_in_the_same_episode() {
     assert_eq!(browser.value(forgotten), json!([clues["commands"][place], "stay"]));
     // The link that opens the same episode is offered.
     assert_eq!(browser.value("document.getElementById('share').checkVisibility()"), true);
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn an_answer_for_other_reset_parameters_is_not_shown() {
+    let (server, mut browser) = (PageServer::start("web"), start("late-answer"));
+    visit(&mut browser, &server, "");
+    // Holds back what the agents reach.
+    browser.value(
+        "globalThis.held = []; Worker.prototype.addEventListener = function (kind, listener) { \
+         EventTarget.prototype.addEventListener.call(this, kind, (event) => held.push(() => listener(event))) }; 0",
+    );
+    for commands in 1..=2 {
+        let options = format!("{{ command_count: '[{commands}]' }}");
+        browser.value(&format!("endless.start({{ id: 'MortarMayhem-Grid-v0', options: {options}, seed: '3' }})"));
+        browser.value(TO_THE_END);
+        browser.wait(&format!("held.length === {commands}"));
+    }
+    browser.value("held.forEach((say) => say())");
+    let counts = "[...document.querySelectorAll('#scores b')].map((score) => score.textContent.slice(1))";
+    assert_eq!(browser.value(counts), json!([" of 2", " of 2"]));
     assert_eq!(browser.complaints, Vec::<String>::new());
 }
 

@@ -9,6 +9,7 @@ mod landing;
 mod layout;
 mod own;
 mod server;
+mod speed;
 
 use std::path::{Path, PathBuf};
 
@@ -35,6 +36,11 @@ fn visit(browser: &mut Chromium, server: &PageServer, link: &str) {
     browser.load("about:blank");
     browser.load(&format!("{}#{link}", server.url()));
     browser.wait(READY);
+}
+
+/// The text of the element with that id.
+fn text(browser: &mut Chromium, id: &str) -> String {
+    browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
 }
 
 fn traces(folder: &str) -> Vec<PathBuf> {
@@ -96,7 +102,7 @@ fn every_environment_is_played_with_the_keyboard() {
         }
         browser.wait(&format!("{STATE}.length > 0"));
         browser.press("Space");
-        assert_eq!(browser.value("document.getElementById('pause').textContent"), "Continue", "{}", spec.id);
+        assert_eq!(text(&mut browser, "pause"), "Continue", "{}", spec.id);
         let before = browser.value(STATE)["length"].as_u64().unwrap();
         browser.press("KeyN");
         let state = browser.value(STATE);
@@ -163,8 +169,8 @@ fn an_address_names_an_episode() {
         browser.load("about:blank");
         browser.load(&format!("{}#{link}", server.url()));
         browser.wait("globalThis.endless && !document.getElementById('message').hidden");
-        let said = browser.value("document.getElementById('message').textContent");
-        assert!(said.as_str().unwrap().starts_with(message), "{link}: {said}");
+        let said = text(&mut browser, "message");
+        assert!(said.starts_with(message), "{link}: {said}");
     }
     assert_eq!(browser.complaints, Vec::<String>::new());
 }
@@ -205,7 +211,7 @@ fn the_form_shows_the_engines_parameter_table() {
         format!("✕ {message}")
     );
     assert_eq!(browser.value("document.getElementById('parameter-arena_size').ariaInvalid"), "true");
-    assert_eq!(browser.value("document.getElementById('message').textContent"), message);
+    assert_eq!(text(&mut browser, "message"), message);
     assert_eq!(browser.value(STATE)["options"], json!({}), "the episode before goes on");
     browser.value(&fill("arena_size", "3"));
     assert_eq!(browser.value(STATE)["options"], json!({"arena_size": "3"}));
@@ -236,8 +242,8 @@ fn a_played_episode_is_saved_verified_and_opened() {
     browser.value("endless.play.start({id: 'MortarMayhem-v0', options: {}, seed: '1'})");
     browser.choose("#file", &file);
     browser.wait(&format!("{STATE}.recording"));
-    let said = browser.value("document.getElementById('message').textContent");
-    assert!(said.as_str().unwrap().ends_with("replayed without a difference."), "{said}");
+    let said = text(&mut browser, "message");
+    assert!(said.ends_with("replayed without a difference."), "{said}");
     browser.press("Space");
     browser.wait(&format!("{STATE}.recording.over"));
     let shown = browser.value(STATE);
