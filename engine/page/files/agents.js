@@ -5,7 +5,9 @@
 const MINUTES = {
   "Endless-MortarMayhem-v0": 32,
   "Endless-MortarMayhem-v0-none": 3,
+  "Endless-MysteryPath-v0": 7,
   "Endless-MysteryPath-v0-none": 1,
+  "Endless-SearingSpotlights-v0": 5,
   "Endless-SearingSpotlights-v0-none": 1,
   "MortarMayhem-Grid-v0": 12,
   "MysteryPath-Grid-v0": 17,
