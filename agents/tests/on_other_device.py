@@ -283,18 +283,7 @@ def memories(folder: Path) -> None:
             torch.testing.assert_close(there, here, rtol=1e-4, atol=1e-4 * float(here.abs().max()), msg=name)
 
 
-CHECKS = (
-    copies,
-    early_release,
-    killed_engine,
-    closing,
-    kept_arrays,
-    rollouts,
-    training,
-    waits,
-    rejects,
-    memories,
-)
+CHECKS = (copies, early_release, killed_engine, closing, kept_arrays, rollouts, training, waits, rejects, memories)
 
 
 def main() -> None:

@@ -1,7 +1,6 @@
 """Checkpoints that are truncated, damaged, foreign, forged or cannot be written."""
 
 import contextlib
-import dataclasses
 import errno
 import itertools
 import json
@@ -14,13 +13,14 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from agents_helpers import same, saved, settings
+from agents_helpers import assert_equal_runs, changed, same, saved, settings, small
 
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import make_agent
@@ -45,7 +45,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train.train(train.parse(arguments))
 
 
-def changed(file: Path, to: Path, **state: Any) -> Path:
+def other(file: Path, to: Path, **state: Any) -> Path:
     """A whole checkpoint with other entries; `None` removes one."""
     content = torch.load(file, weights_only=True) | state
     torch.save({name: part for name, part in content.items() if part is not None}, to)
@@ -108,26 +108,15 @@ def test_a_run_that_saves_while_its_checkpoint_is_read(
 
 def test_a_run_continues_exactly_in_another_folder_with_another_number_of_cores(tmp_path: Path) -> None:
     """As on another machine, from parts that were copied there."""
-    flags = [
-        "--env",
-        "MortarMayhem-Grid-v0",
-        "--preset",
-        "quick",
-        "--threads",
-        "1",
-        "--environment.num-envs",
-        "8",
-        "--run",
-    ]
-    train.train(train.parse([*flags, str(tmp_path / "whole"), "--ppo.updates", "4"]))
-    parts = ["--checkpoint-megabytes", "0.1", "--ppo.updates", "2"]
-    shutil.move(train.train(train.parse([*flags, str(tmp_path / "first"), *parts])), tmp_path / "second")
+    given = replace(small("gru", tmp_path / "whole", 4, groups=1), checkpoint_megabytes=0.03)
+    whole = train.train(given)
+    half = train.train(changed(given, run=str(tmp_path / "first"), ppo={"updates": 2}))
+    shutil.move(half, tmp_path / "second")
     assert len(list((tmp_path / "second" / "checkpoints").iterdir())) > 3
     command = [sys.executable, "-m", "endless_gym_agents.train", "--resume", "second", "--ppo.updates", "4"]
     core = min(os.sched_getaffinity(0))
     subprocess.run(["taskset", "-c", str(core), *command], cwd=tmp_path, check=True, timeout=120)
-    one, two = (checkpoint.load(tmp_path / name).state for name in ("whole", "second"))
-    assert two["update"] == 4 and same(one | {"settings": None}, two | {"settings": None})
+    assert_equal_runs(whole, tmp_path / "second")
 
 
 def test_a_truncated_checkpoint_is_refused_at_any_length(file: Path, tmp_path: Path) -> None:
@@ -158,7 +147,7 @@ def test_a_changed_byte_is_reported_or_changes_nothing(file: Path, tmp_path: Pat
 
 def test_the_message_names_what_is_wrong(file: Path, tmp_path: Path) -> None:
     given = torch.load(file, weights_only=True)
-    weights, other = given["model"], settings("gru", recurrence={"hidden_size": 17})
+    weights, wide = given["model"], settings("gru", recurrence={"hidden_size": 17})
     name = next(iter(weights))
     for state, message in [
         ({"version": 7}, "must be of version 1, got 7"),
@@ -169,13 +158,13 @@ def test_the_message_names_what_is_wrong(file: Path, tmp_path: Path) -> None:
             for value in (torch.nan, torch.inf)
         ),
         ({"model": {key: part for key, part in weights.items() if key != name}}, f"there are no weights {name}"),
-        ({"settings": to_dict(other)}, r"must have shape \(.*17.*\) according to the settings, got"),
-        ({"settings": to_dict(dataclasses.replace(other, env="Other-v0"))}, "id must be one of"),
+        ({"settings": to_dict(wide)}, r"must have shape \(.*17.*\) according to the settings, got"),
+        ({"settings": to_dict(replace(wide, env="Other-v0"))}, "id must be one of"),
         ({"settings": 3}, "settings or weights are invalid"),
         ({"model": []}, "settings or weights are invalid"),
     ]:
         with pytest.raises(ValueError, match=message):
-            checkpoint.load(changed(file, tmp_path / "changed.pt", **state))
+            checkpoint.load(other(file, tmp_path / "changed.pt", **state))
     for content, message in [([1], "a list, not a dict"), ({"version": Path()}, "not a checkpoint of endless-train")]:
         torch.save(content, tmp_path / "changed.pt")
         with pytest.raises(ValueError, match=message):
@@ -196,7 +185,7 @@ def test_the_message_names_what_is_wrong(file: Path, tmp_path: Path) -> None:
 def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_built(
     claimed: dict[str, Any], file: Path, tmp_path: Path
 ) -> None:
-    forged = changed(file, tmp_path / "forged.pt", settings=to_dict(settings("gru", **claimed)))
+    forged = other(file, tmp_path / "forged.pt", settings=to_dict(settings("gru", **claimed)))
     memory, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     with pytest.raises(ValueError, match=r"settings or weights are invalid"):
         checkpoint.load(forged)
@@ -215,9 +204,7 @@ def test_weights_that_repeat_few_numbers_or_are_missing_take_no_memory(
             name: part.shape for name, part in make_agent(claimed, spec(claimed.env), "meta").state_dict().items()
         }
     weights = {name: torch.zeros(()).expand(shape) for name, shape in shapes.items()} if repeats else {}
-    forged = changed(
-        file, tmp_path / "forged.pt", settings=to_dict(claimed), model=weights, optimizer=None, player=None
-    )
+    forged = other(file, tmp_path / "forged.pt", settings=to_dict(claimed), model=weights, optimizer=None, player=None)
     assert forged.stat().st_size < 100_000
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match=r"claim 3|there are no weights"):
@@ -255,7 +242,7 @@ def test_a_checkpoint_without_the_state_of_the_run_cannot_be_resumed(
 ) -> None:
     shutil.copytree(trained, tmp_path / "run")
     last = tmp_path / "run" / "checkpoints" / "last.pt"
-    changed(last, last, **state)
+    other(last, last, **state)
     checkpoint.load(last)
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["endless-train", "--resume", str(tmp_path / "run"), "--ppo.updates", "2"])

@@ -297,10 +297,7 @@ def of(name: str, start: str) -> dict[str, Any]:
 
 def test_initial_values_are_those_of_the_authors() -> None:
     torch.manual_seed(0)
-    for start, options in (
-        ("defaults", {}),
-        ("r_min 0.9", {"r_min": 0.9, "r_max": 0.999, "max_phase": 0.314}),
-    ):
+    for start, options in (("defaults", {}), ("r_min 0.9", {"r_min": 0.9, "r_max": 0.999, "max_phase": 0.314})):
         layer, numbers = LRU(4, 4, state_size=20_000, **options), of("lru", start)
         described(layer.eigenvalues().abs(), numbers["|lambda|"], start)
         described(layer.theta.exp(), numbers["phase"], start)

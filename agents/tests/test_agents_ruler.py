@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from agents_helpers import changed
+from agents_helpers import assert_equal_runs, changed
 from gymnasium.spaces import flatten
 
 from endless_gym import spec
 from endless_gym_agents.agent.agent import make_agent
 from endless_gym_agents.environments import wrappers
-from endless_gym_agents.evaluation import conformance, ruler
+from endless_gym_agents.evaluation import conformance, enjoy, ruler
 from endless_gym_agents.evaluation.evaluate import evaluate
 from endless_gym_agents.evaluation.ruler import TASKS
 from endless_gym_agents.paper import leaderboard
@@ -81,19 +81,19 @@ def test_the_agents_of_a_size_have_as_many_parameters_as_that_of_the_gru(name: s
             assert counts[agent] == pytest.approx(counts["gru"], rel=0.05), (size, agent)
 
 
-def test_agents_of_popgym_resume_exactly(tmp_path: Path) -> None:
-    given = settings_of("popgym-CountRecallEasy-v0", {"preset": "quick", **TASKS["count-recall"].flags()})
+def test_agents_of_popgym_resume_exactly_and_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = settings_of("popgym-CountRecallEasy-v0?num_decks=2", {"preset": "quick", **TASKS["count-recall"].flags()})
     given = changed(
         given, agent="lru", threads=1, environment={"num_envs": 4, "num_threads": 1}, recurrence={"hidden_size": 16}
     )
     given = changed(given, ppo={"updates": 4, "steps": 30, "minibatches": 1})
-    whole = checkpoint.load(training.train(replace(given, run=str(tmp_path / "whole"))))
+    whole = training.train(replace(given, run=str(tmp_path / "whole")))
     part = training.train(replace(given, run=str(tmp_path / "part")), lambda update, _: update == 2)
-    resumed = checkpoint.load(training.train(replace(given, resume=str(part))))
-    # Two ranks of cards, the previous action, and whether the step is the first.
-    assert whole.agent.observation_shapes == {"features": (2 + 2 + 27 + 2,)}
-    for name, tensor in whole.agent.state_dict().items():
-        assert torch.equal(tensor, resumed.agent.state_dict()[name]), name
+    training.train(replace(given, resume=str(part)))
+    assert_equal_runs(part, whole)
+    film = tmp_path / "film.webp"
+    enjoy.execute(enjoy.EnjoyArguments(whole, max_steps=3, out=film))
+    assert "in 3 steps" in capsys.readouterr().out and film.read_bytes()[8:12] == b"WEBP"
     with pytest.raises(
         ValueError, match=r"got MultiDiscrete\(.*by --environment.wrapper endless_gym_agents.popgym:Vec"
     ):

@@ -315,18 +315,8 @@ def serving(name: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
 def test_a_run_in_a_served_engine_outlives_the_engine(tmp_path: Path) -> None:
     name, run = f"learn-{tmp_path.name}", tmp_path / "run"
     flags = ["--features", "--no-frames", "--autoreset", "same-step"]
-    learning = FLAGS.replace("--environment.num-envs 8 ", "").split()
-    command = [
-        *PROGRAM,
-        "MortarMayhem-Grid-v0",
-        "--connect",
-        name,
-        *learning,
-        "--ppo.updates",
-        "1000000",
-        "--run",
-        str(run),
-    ]
+    given = f"MortarMayhem-Grid-v0 --connect {name} {FLAGS} --ppo.updates 1000000 --run {run}"
+    command = [*PROGRAM, *given.replace("--environment.num-envs 8 ", "").split()]
     with serving(name, *flags) as engine:
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None

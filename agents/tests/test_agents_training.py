@@ -300,11 +300,7 @@ def test_agent_with_memory_learns_a_command_that_is_shown_and_hidden(agent: str,
 )
 def test_bootstrapping_adds_the_value_of_the_last_observation_at_time_limits(agent: str, env: str) -> None:
     """Against episodes played one after another, with the values of their last observations."""
-    given = changed(
-        settings(agent, env=env),
-        environment={"num_envs": 3, "wrapper": (VECTORS,)},
-        ppo={"steps": 256},
-    )
+    given = changed(settings(agent, env=env), environment={"num_envs": 3, "wrapper": (VECTORS,)}, ppo={"steps": 256})
     plain, bootstrapped = (changed(given, ppo={"bootstrap_truncated": is_on}) for is_on in (False, True))
     with collecting(plain) as collector:
         expected = collector.collect(Clock())[0]
