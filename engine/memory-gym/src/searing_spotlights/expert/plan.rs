@@ -48,11 +48,24 @@ fn moved(place: Place, pixels: Place) -> Place {
 #[derive(Clone, Debug, PartialEq)]
 struct Places([u128; SCREEN]);
 
-/// The bits `first..=last`.
+/// The bits below each number, since WebAssembly is slow at shifts of 128 bits by numbers that vary.
+const BELOW: [u128; 128] = {
+    let mut below = [0; 128];
+    let mut end = 1;
+    while end < below.len() {
+        below[end] = (below[end - 1] << 1) | 1;
+        end += 1;
+    }
+    below
+};
+
+/// The bits `first..=last`, below 127.
 fn bits(first: i32, last: i32) -> u128 {
-    let below = |end: i32| (1_u128 << end.clamp(0, 127)) - 1;
-    below(last + 1) & !below(first)
+    BELOW[(last + 1).clamp(0, 127) as usize] & !BELOW[first.clamp(0, 127) as usize]
 }
+
+/// The columns of the agent's centre.
+const WALKABLE: u128 = BELOW[HIGH[0] as usize + 1] & !BELOW[LOW[0] as usize];
 
 impl Places {
     const NONE: Places = Places([0; SCREEN]);
@@ -80,10 +93,13 @@ impl Places {
     /// The places from which an action leads into the set.
     fn before(&self) -> Self {
         let mut before = Places::NONE;
-        for (_, [dx, dy]) in MOVES {
+        let [straight, level, diagonal] = self.rows(
+            |row| columns_before::<-3>(row) | columns_before::<3>(row),
+            |row| columns_before::<-2>(row) | columns_before::<2>(row),
+        );
+        for (dy, rows) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
             for y in LOW[1]..=HIGH[1] {
-                let target = (y + dy).clamp(LOW[1], HIGH[1]);
-                before.0[y as usize] |= columns_before(self.0[target as usize], dx);
+                before.0[y as usize] |= rows[(y + dy).clamp(LOW[1], HIGH[1]) as usize];
             }
         }
         before
@@ -92,13 +108,22 @@ impl Places {
     /// The places to which an action leads from the set.
     fn after(&self) -> Self {
         let mut after = Places::NONE;
-        for (_, [dx, dy]) in MOVES {
+        let [straight, level, diagonal] = self.rows(
+            |row| columns_after::<-3>(row) | columns_after::<3>(row),
+            |row| columns_after::<-2>(row) | columns_after::<2>(row),
+        );
+        for (dy, rows) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
             for y in LOW[1]..=HIGH[1] {
-                let target = (y + dy).clamp(LOW[1], HIGH[1]);
-                after.0[target as usize] |= columns_after(self.0[y as usize], dx);
+                after.0[(y + dy).clamp(LOW[1], HIGH[1]) as usize] |= rows[y as usize];
             }
         }
         after
+    }
+
+    /// The columns of each row after the [`MOVES`] that go straight up or down, stay in the row, or are diagonal.
+    fn rows(&self, aside: impl Fn(u128) -> u128, diagonal: impl Fn(u128) -> u128) -> [[u128; SCREEN]; 3] {
+        let straight = self.0.map(|row| row & WALKABLE);
+        [straight, straight.map(|row| row | aside(row)), straight.map(diagonal)]
     }
 
     fn iter(&self) -> impl Iterator<Item = Place> + '_ {
@@ -109,28 +134,24 @@ impl Places {
     }
 }
 
-/// The columns from which a move of `dx`, clamped to the limits, leads into `row`.
-fn columns_before(row: u128, dx: i32) -> u128 {
-    let walkable = bits(LOW[0], HIGH[0]);
-    let row = row & walkable;
-    let shifted = if dx >= 0 { row >> dx } else { row << -dx };
+/// The columns from which a move of `DX`, clamped to the limits, leads into `row`, whose columns are walkable.
+fn columns_before<const DX: i32>(row: u128) -> u128 {
+    let shifted = if DX >= 0 { row >> DX } else { row << -DX };
     let (edge, held) =
-        if dx >= 0 { (HIGH[0], bits(HIGH[0] - dx, HIGH[0])) } else { (LOW[0], bits(LOW[0], LOW[0] - dx)) };
+        if DX >= 0 { (HIGH[0], bits(HIGH[0] - DX, HIGH[0])) } else { (LOW[0], bits(LOW[0], LOW[0] - DX)) };
     let held = if row & bits(edge, edge) != 0 { held } else { 0 };
-    (shifted | held) & walkable
+    (shifted | held) & WALKABLE
 }
 
-/// The columns to which a move of `dx`, clamped to the limits, leads from `row`.
-fn columns_after(row: u128, dx: i32) -> u128 {
-    let walkable = bits(LOW[0], HIGH[0]);
-    let row = row & walkable;
-    let shifted = if dx >= 0 { row << dx } else { row >> -dx };
-    let held = match shifted & !walkable {
+/// The columns to which a move of `DX`, clamped to the limits, leads from `row`, whose columns are walkable.
+fn columns_after<const DX: i32>(row: u128) -> u128 {
+    let shifted = if DX >= 0 { row << DX } else { row >> -DX };
+    let held = match shifted & !WALKABLE {
         0 => 0,
-        _ if dx > 0 => bits(HIGH[0], HIGH[0]),
+        _ if DX > 0 => bits(HIGH[0], HIGH[0]),
         _ => bits(LOW[0], LOW[0]),
     };
-    (shifted & walkable) | held
+    (shifted & WALKABLE) | held
 }
 
 /// The places where the agent is hit in a step.
@@ -144,7 +165,8 @@ impl Danger {
 
     /// Adds all places within `reach` pixels of `centre`.
     pub fn add(&mut self, centre: [f64; 2], reach: f64) {
-        for (y, row) in self.0.0.iter_mut().enumerate() {
+        let [first, end] = [centre[1] - reach, centre[1] + reach + 2.0].map(|y| (y.max(0.0) as usize).min(SCREEN));
+        for (y, row) in self.0.0.iter_mut().enumerate().take(end).skip(first) {
             let rest = reach * reach - (y as f64 - centre[1]).powi(2);
             if rest >= 0.0 {
                 let half = rest.sqrt();
