@@ -143,27 +143,3 @@ impl Character {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_character_faces_the_way_that_it_moves() {
-        for (x, y) in (0..3).flat_map(|x| (0..3).map(move |y| (x, y))) {
-            let mut character = Character { rotation: 270, ..Character::default() };
-            let [right, down] = character.turn(&[x, y]);
-            let towards = |branch: i32| [0.0, -1.0, 1.0][branch as usize];
-            let (expected_right, expected_down): (f64, f64) = (towards(x), towards(y));
-            if (x, y) == (0, 0) {
-                assert_eq!((right, down, character.rotation), (0.0, 0.0, 270));
-                continue;
-            }
-            let length = (expected_right * expected_right + expected_down * expected_down).sqrt();
-            assert_eq!((right, down), (expected_right / length, expected_down / length));
-            // Counterclockwise from up.
-            let degrees = (-expected_right).atan2(-expected_down).to_degrees().rem_euclid(360.0);
-            assert_eq!(f64::from(character.rotation), degrees.round(), "{x}, {y}");
-        }
-    }
-}

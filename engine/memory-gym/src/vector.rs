@@ -30,32 +30,3 @@ pub fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
     let [x, y] = [b[0] - a[0], b[1] - a[1]];
     (x * x + y * y).sqrt()
 }
-
-#[cfg(test)]
-mod tests {
-    use super::{distance, lerp, rotate};
-
-    #[test]
-    fn points_between_and_distances_equal_pygames() {
-        assert_eq!(lerp([2.0, -4.0], [10.0, 4.0], 0.25), [4.0, -2.0]);
-        assert_eq!(lerp([0.1, 0.2], [0.7, 0.3], 0.0), [0.1, 0.2]);
-        assert_eq!(distance([1.0, 2.0], [4.0, -2.0]), 5.0);
-    }
-
-    /// Values printed by pygame 2.4.
-    #[test]
-    fn rotations_equal_pygames() {
-        for (degrees, expected) in [
-            (45.0, [-4.440892098500626e-16, -5.65685424949238]),
-            (90.0, [4.0, -4.0]),
-            (135.0, [5.65685424949238, -4.440892098500626e-16]),
-            (180.0, [4.0, 4.0]),
-            (225.0, [8.881784197001252e-16, 5.656854249492381]),
-            (270.0, [-4.0, 4.0]),
-            (315.0, [-5.65685424949238, 1.3322676295501878e-15]),
-            (360.0, [-4.0, -4.0]),
-        ] {
-            assert_eq!(rotate([-4.0, -4.0], degrees), expected, "{degrees} degrees");
-        }
-    }
-}
