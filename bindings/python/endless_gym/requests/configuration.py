@@ -87,10 +87,11 @@ def checked_arguments(
     first_env = integer("first_env", first_env, 0, MAX_TOTAL_ENVS)
     end = first_env + groups * num_envs
     total_envs = end if total_envs is None else integer("total_envs", total_envs, end, MAX_TOTAL_ENVS)
-    chosen: dict[str, Any] | list[dict[str, Any]] = {}
-    if options is not None:
-        each = [given or {} for given in mappings("options", options, groups * num_envs)]
-        chosen = each[0] if isinstance(options, Mapping) else each
+    chosen: dict[str, Any] | list[dict[str, Any]]
+    if options is None or isinstance(options, Mapping):
+        chosen = dict(options or {})
+    else:
+        chosen = [given or {} for given in mappings("options", options, groups * num_envs)]
     source = seeding(seed, seeds, total_envs)
     frames, features = contents(described, observation, frames)
     pools = [
