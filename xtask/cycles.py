@@ -20,9 +20,7 @@ ROOMS = [
     ["_native", "arguments", "specs", "display", "program", "requests", "vector", "recording", "cli"],
     ["common", "settings", "environments", "memories", "agent", "training", "evaluation", "paper"],
 ]
-#: The crates, except that of Python, whose files read the registry of its root.
 CRATES = [path.parent for path in sorted([*Path().glob("*/*/Cargo.toml"), Path("xtask/Cargo.toml")])]
-CRATES.remove(Path("bindings/python"))
 
 Module = tuple[str, ...]
 

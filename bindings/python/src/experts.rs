@@ -7,7 +7,7 @@ use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUnty
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
-use crate::environments;
+use crate::environments::environments;
 
 /// One scripted expert for each of `num_envs` environments.
 #[pyclass(module = "endless_gym._native")]

@@ -16,6 +16,7 @@ mod arrays;
 mod buffers;
 mod connection;
 mod ends;
+mod environments;
 mod errors;
 mod experts;
 #[cfg(feature = "native")]
@@ -28,7 +29,6 @@ mod pool;
 mod single;
 
 use std::ffi::OsString;
-use std::sync::OnceLock;
 
 use endless_gym::DEFAULT_ENV_ID;
 #[cfg(feature = "native")]
@@ -38,14 +38,8 @@ use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
+use environments::{ENVIRONMENTS, environments};
 pub use pyo3;
-
-/// The environments of this module. Every extension module is a shared object, with statics of its own.
-static ENVIRONMENTS: OnceLock<Registry> = OnceLock::new();
-
-fn environments() -> &'static Registry {
-    ENVIRONMENTS.get_or_init(Registry::new)
-}
 
 /// The specifications of all environments, as JSON text.
 #[pyfunction]

@@ -15,7 +15,8 @@ use pyo3::types::{PyBytes, PyList, PyTuple};
 use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::buffers::Buffers;
 use crate::connection::{Kept, lock};
-use crate::{arrays, environments, errors};
+use crate::environments::environments;
+use crate::{arrays, errors};
 
 /// Checks the configuration of a group, from JSON text, without making environments.
 #[pyfunction]

@@ -10,7 +10,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arguments::{self, ActionShape};
-use crate::{arrays, environments, errors};
+use crate::environments::environments;
+use crate::{arrays, errors};
 
 /// Frames, features, vector observation and ground truth; `None` for those that the environment does not have.
 type Arrays<'py> = [Option<Bound<'py, PyAny>>; 4];
