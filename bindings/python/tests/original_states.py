@@ -1,5 +1,6 @@
-"""The spaces, Markov states, observations, rewards and ends of POPGym's environments. As a program, it prints those of the original,
-`popgym`, as JSON.
+"""The spaces, states, observations, rewards and ends of POPGym's environments.
+
+As a program, it prints those of the original, `popgym`, as JSON.
 
 `tests/reference/popgym/states.json.gz` has what it printed for popgym 1.0.7 and the seed 20261128.
 """

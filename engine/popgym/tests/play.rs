@@ -1,6 +1,7 @@
 //! Tests of the experts of all ids. The checks of `conformance` and `tests/fuzz` play all ids, too.
 
 use endless_gym_core::batch::{Batch, zeroed};
+use endless_gym_core::conformance;
 use endless_gym_core::pool::{Autoreset, Experts, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym_popgym::popgym;
 
@@ -72,4 +73,27 @@ fn experts_reach_what_can_be_reached() {
     played.sort_unstable();
     ids.sort_unstable();
     assert_eq!(played, ids);
+}
+
+#[test]
+fn ids_with_arguments_follow_the_rules() {
+    for (id, is_played_by_experts) in [
+        ("popgym-AutoencodeEasy-v0?num_decks=9", true),
+        ("popgym-BattleshipEasy-v0?board_size=20&ship_sizes=20,1,5,5,4,3,3,2", false),
+        ("popgym-BattleshipEasy-v0?board_size=5", true),
+        ("popgym-ConcentrationEasy-v0?num_decks=9&deck_type=ranks", false),
+        ("popgym-ConcentrationEasy-v0?num_decks=3", true),
+        ("popgym-CountRecallEasy-v0?num_decks=63", true),
+        ("popgym-LabyrinthEscapeEasy-v0?maze_dims=6,62&episode_length=2", true),
+        ("popgym-LabyrinthExploreEasy-v0?maze_dims=62,6&episode_length=100", true),
+        ("popgym-MultiarmedBanditEasy-v0?num_bandits=1000&episode_length=1", true),
+        ("popgym-NoisyPositionOnlyCartPoleEasy-v0?noise_sigma=1e6&sutton_barto_reward=true", true),
+        ("popgym-NoisyPositionOnlyPendulumEasy-v0?noise_sigma=0&g=-1000", true),
+        ("popgym-RepeatPreviousEasy-v0?num_decks=9&k=467", true),
+    ] {
+        let outcomes = conformance::check(popgym(), id).unwrap();
+        let broken: Vec<_> = outcomes.iter().filter(|outcome| outcome.problem.is_some()).collect();
+        assert!(broken.is_empty(), "{id}: {broken:?}");
+        assert!(!is_played_by_experts || expert_return(id, 2).is_finite());
+    }
 }
