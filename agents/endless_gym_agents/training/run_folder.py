@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import itertools
 import os
+import re
 import socket
 import time
 import warnings
@@ -76,7 +77,8 @@ def _new_folder(settings: Settings) -> Path:
     """Make the folder of a run without a given one; runs that start in the same second get different folders."""
     name = f"{settings.agent_name}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     for suffix in itertools.chain([""], (f"-{number}" for number in itertools.count(2))):
-        run = Path("runs", settings.env, name + suffix)
+        # A shell reads the `?` and `&` of an id with arguments otherwise.
+        run = Path("runs", re.sub("[?&]", "_", settings.env), name + suffix)
         with contextlib.suppress(FileExistsError):
             run.mkdir(parents=True)
             break

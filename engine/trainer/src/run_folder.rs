@@ -73,7 +73,8 @@ fn new_folder(settings: &Settings) -> Result<PathBuf, Error> {
     let agent = serde_json::to_value(settings.agent).ok().and_then(|agent| Some(agent.as_str()?.to_owned()));
     let time = now().replace(['-', ':'], "").replace(' ', "-");
     let name = format!("{}-{}-{time}", agent.unwrap_or_default(), settings.seed);
-    let parent = Path::new("runs").join(&settings.env);
+    // A shell reads the `?` and `&` of an id with arguments otherwise.
+    let parent = Path::new("runs").join(settings.env.replace(['?', '&'], "_"));
     fs::create_dir_all(&parent).map_err(file(&parent))?;
     for number in 1.. {
         let path = parent.join(if number == 1 { name.clone() } else { format!("{name}-{number}") });
