@@ -108,8 +108,7 @@ def test_run_can_be_resumed_from_update_0(tmp_path: Path) -> None:
     time.sleep(1 - time.time() % 1)
     train(parse(["--resume", str(run)]))
     assert progress(run) == progress(train(small("gru", tmp_path / "through", 2)))
-    board = EventAccumulator(str(run))
-    board.Reload()
+    board = EventAccumulator(str(run)).Reload()
     assert [event.step for event in board.Scalars("update")] == [128, 256]
 
 
@@ -200,20 +199,13 @@ def test_resumed_run_keeps_its_settings(tmp_path: Path) -> None:
         train(small("gru", run, 2))
 
 
-def test_tensorboard_files_contain_the_metrics(tmp_path: Path) -> None:
-    run = train(small("gru", tmp_path / "run", 2))
-    board = EventAccumulator(str(run))
-    board.Reload()
+def test_tensorboard_files_contain_the_metrics(undisturbed: Path) -> None:
+    run, board = undisturbed, EventAccumulator(str(undisturbed)).Reload()
     losses = [event.value for event in board.Scalars("learning/policy_loss")]
     assert losses == pytest.approx([row["policy_loss"] for row in progress(run)], rel=1e-5)
     assert [event.step for event in board.Scalars("learning/policy_loss")] == [row["steps"] for row in progress(run)]
-    assert {
-        "episode/reward",
-        "episode/task_progress",
-        "seconds/stepping",
-        "seconds/inference",
-        "seconds/learning",
-    } <= set(board.Tags()["scalars"])
+    names = {"episode/reward", "episode/task_progress", "seconds/stepping", "seconds/inference", "seconds/learning"}
+    assert names <= set(board.Tags()["scalars"])
 
 
 def test_total_steps_set_the_length_and_each_line_has_the_time_left(
@@ -282,9 +274,9 @@ def test_bf16_changes_results_slightly_and_keeps_float32_weights(agent: str, tmp
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("agent", ["gru", "trxl"])
-def test_agent_with_memory_learns_a_command_that_is_shown_and_hidden(agent: str, tmp_path: Path) -> None:
-    given = replace(PRESETS["quick"], env=GRID, agent=agent, run=str(tmp_path / agent), threads=1, target_reward=0.097)
+def test_a_transformer_learns_a_command_that_is_shown_and_hidden(tmp_path: Path) -> None:
+    """As a GRU does in `test_agents_example.py`."""
+    given = replace(PRESETS["quick"], env=GRID, agent="trxl", run=str(tmp_path / "run"), threads=1, target_reward=0.097)
     given = changed(given, environment={"option": ("command_count=[1]",)}, ppo={"updates": 200})
     trained = checkpoint.load(train(given))
     assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085

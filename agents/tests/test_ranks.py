@@ -19,7 +19,7 @@ import torch
 import endless_gym
 from endless_gym_agents.environments.ranks import Ranks
 from endless_gym_agents.training import checkpoint
-from endless_gym_agents.training.logs import PROGRESS, read_progress
+from endless_gym_agents.training.logs import read_progress
 from endless_gym_agents.training.train import parse, train
 
 ARGUMENTS = " ".join(
@@ -47,10 +47,6 @@ def finished(process: subprocess.Popen[str], run: Path, expected: int = 0) -> Pa
 
 def last(run: Path) -> dict[str, Any]:
     return torch.load(run / checkpoint.FOLDER / checkpoint.LAST, weights_only=True)
-
-
-def rows(run: Path) -> list[dict[str, Any]]:
-    return read_progress(run) if (run / PROGRESS).exists() else []
 
 
 def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], run: Path) -> None:
@@ -116,7 +112,7 @@ def test_ranks_compute_what_one_process_computes(
     for name, weights in one["model"].items():
         torch.testing.assert_close(several["model"][name], weights, rtol=0, atol=1e-5)
     assert one["steps"] == several["steps"]
-    for expected, found in zip(rows(alone), rows(together), strict=True):
+    for expected, found in zip(read_progress(alone), read_progress(together), strict=True):
         assert expected.keys() == found.keys()
         for name in expected:
             if not name.startswith("seconds/") and name != "steps_per_second":
@@ -128,11 +124,11 @@ def test_run_restarts_when_a_rank_is_killed(tmp_path: Path, segments: Callable[[
     undisturbed = start(tmp_path / "undisturbed", 2, *engines, "--ppo.updates", "12")
     finished(undisturbed, tmp_path / "undisturbed")
     process = start(run, 2, *engines, "--ppo.updates", "12", restarts=1)
-    wait_until(lambda: len(rows(run)) >= 2, process, run)
+    wait_until(lambda: len(read_progress(run)) >= 2, process, run)
     os.kill(ranks_of(process)[1], signal.SIGKILL)
     finished(process, run)
     assert "rank 0 of 2: another rank has ended" in log(run).read_text()
-    assert [row["update"] for row in rows(run)] == list(range(1, 13))
+    assert [row["update"] for row in read_progress(run)] == list(range(1, 13))
     expected, found = last(tmp_path / "undisturbed"), last(run)
     for name, weights in expected["model"].items():
         assert torch.equal(found["model"][name], weights), name
@@ -142,7 +138,7 @@ def test_run_restarts_when_a_rank_is_killed(tmp_path: Path, segments: Callable[[
 def test_all_ranks_end_within_seconds_of_one(tmp_path: Path, segments: Callable[[], set[str]], start: Start) -> None:
     run = tmp_path / "run"
     process = start(run, 2, "--agent", "none", "--environment.engine", "process", *ENDLESS)
-    wait_until(lambda: len(rows(run)) >= 1, process, run)
+    wait_until(lambda: len(read_progress(run)) >= 1, process, run)
     ranks = ranks_of(process)
     os.kill(ranks[0], signal.SIGKILL)
     killed = time.monotonic()
@@ -156,11 +152,11 @@ def test_all_ranks_end_within_seconds_of_one(tmp_path: Path, segments: Callable[
 def test_interrupted_run_resumes_with_the_same_or_another_number_of_ranks(tmp_path: Path, start: Start) -> None:
     run = tmp_path / "run"
     process = start(run, 2, "--agent", "trxl", *ENDLESS)
-    wait_until(lambda: len(rows(run)) >= 2, process, run)
+    wait_until(lambda: len(read_progress(run)) >= 2, process, run)
     # Like Ctrl-C in a terminal, which torchrun also forwards.
     os.killpg(process.pid, signal.SIGINT)
     process.wait(timeout=100)
-    text, done = log(run).read_text(), len(rows(run))
+    text, done = log(run).read_text(), len(read_progress(run))
     assert f"{done} of 100000 updates done" in text
     assert last(run)["update"] == done
 
@@ -177,7 +173,7 @@ def test_interrupted_run_resumes_with_the_same_or_another_number_of_ranks(tmp_pa
     before = last(run)["steps"]
     train(parse(["--resume", str(run), "--ppo.updates", str(done + 3)]))
     assert last(run)["steps"] == before + 8 * 16
-    assert [row["update"] for row in rows(run)] == list(range(1, done + 4))
+    assert [row["update"] for row in read_progress(run)] == list(range(1, done + 4))
 
 
 def test_no_thread_outlives_the_connection(tmp_path: Path) -> None:
@@ -196,7 +192,7 @@ assert not any("gloo" in name for name in names), names
     command, environment = [*TORCHRUN, "--nproc-per-node=2", program], os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=250, env=environment)
     assert done.returncode == 0, done.stderr
-    assert len(rows(tmp_path / "run")) == 3
+    assert len(read_progress(tmp_path / "run")) == 3
 
 
 def test_environments_that_cannot_be_divided_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
