@@ -81,6 +81,7 @@ fn the_page_offers_the_agents_whose_files_it_has() {
 
     let script = String::from_utf8(decompress(file("agents.js").unwrap())).unwrap();
     let table = script.split_once("const MINUTES = {").unwrap().1.split_once('}').unwrap().0;
-    let offered = table.split('"').skip(1).step_by(2).collect::<BTreeSet<_>>();
-    assert_eq!(offered, FILES.iter().filter_map(|(name, _)| name.strip_suffix(AGENT)).collect());
+    let offered: BTreeSet<&str> = table.split('"').skip(1).step_by(2).collect();
+    let found: BTreeSet<&str> = FILES.iter().filter_map(|(name, _)| name.strip_suffix(AGENT)).collect();
+    assert_eq!(offered, found);
 }
