@@ -119,6 +119,11 @@ fn a_running_engine_is_shown_lost_and_found() {
     browser.value("document.getElementById('after').click()");
     browser.wait("document.querySelectorAll('#grid canvas').length === 4");
     (0..4).for_each(|place| assert_shown(&mut browser, &grid(place), &observations, 16 + place));
+    // The range says why a button is disabled, and the keyboard still reaches it.
+    let buttons = "['before', 'after'].map((id) => document.getElementById(id)).map((button) => [button.ariaDisabled, button.disabled, \
+                   button.ariaDescribedByElements[0].textContent])";
+    let range = "16 to 19 of 20";
+    assert_eq!(browser.value(buttons), serde_json::json!([["false", false, range], ["true", false, range]]));
     browser.value("document.getElementById('smaller').click()");
     assert_eq!(browser.value("document.getElementById('enlarged').checkVisibility()"), false);
 
