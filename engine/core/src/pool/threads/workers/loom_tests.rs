@@ -56,17 +56,7 @@ fn model(preemptions: usize, model: impl Fn() + Sync + Send + 'static) {
 }
 
 #[test]
-fn loom_every_piece_is_done_once_and_seen_by_the_caller() {
-    model(3, || {
-        let workers = Workers::new(1, true, false).unwrap();
-        let pieces = Pieces::new(2);
-        workers.run(1, &|_| pieces.work());
-        pieces.check();
-    });
-}
-
-#[test]
-fn loom_a_second_call_wakes_parked_workers_and_is_not_joined_by_the_first_ones() {
+fn loom_every_piece_of_two_calls_is_done_once_and_seen_by_the_caller() {
     model(3, || {
         let workers = Workers::new(1, true, false).unwrap();
         for _ in 0..2 {
