@@ -18,7 +18,7 @@ const MAGIC: [u8; 4] = *b"EGYM";
 pub(crate) const HEAD: usize = 12;
 
 /// Version of the snapshot format. It changes with every change to the content.
-pub const SNAPSHOT_VERSION: u32 = 2;
+pub const SNAPSHOT_VERSION: u32 = 3;
 
 /// The content of a snapshot.
 #[derive(Debug, Serialize, Deserialize)]
