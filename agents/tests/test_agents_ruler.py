@@ -255,6 +255,19 @@ def test_a_track_of_your_own_is_tuned_resumed_and_extended(
 
 
 @pytest.mark.usefixtures("in_process")
+def test_a_track_has_the_gap_to_fully_observable_twins(tmp_path: Path) -> None:
+    wide = TRACK["agents"][1]
+    file = written(tmp_path, agents=["none", wide, wide | {"name": "twin", "observable": True}], tasks=["one-command"])
+    leaderboard.execute(leaderboard.LeaderboardArguments(str(file), device="cpu", jobs=1, out=tmp_path / "out"))
+    assert (tmp_path / "out/runs/MortarMayhemB-Grid-v0/one-command twin -/seed-1").is_dir()
+    rows = json.loads((tmp_path / "out/mine/results.json").read_text())["rows"]
+    score = {row["agent"]: row["score"] for row in rows}
+    gap = (score["twin"] - score["gru-wide"]) / (0.1 - score["none"])
+    page = (tmp_path / "out/mine/README.md").read_text()
+    assert "gap of `gru-wide` |" in page and f"| {gap:.2f} |" in page
+
+
+@pytest.mark.usefixtures("in_process")
 def test_an_agent_enters_a_track_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a smaller version, which has other budgets than the package's rows; the best agents are exported."""
     best, folder = tmp_path / "best", tmp_path / "out/scale-2e-05/laptop"

@@ -436,13 +436,35 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
         *compare.markdown(comparison, "## Agents"),
         *longer_table(track, rows),
     ]
+    # Each agent that trains on the twins, and the same agent in the tasks.
+    agents = track.agents.values()
+    pairs = [
+        (twin, one)
+        for twin in agents
+        if twin.observable
+        for one in agents
+        if (one.flags, one.observable) == (twin.flags, False)
+    ]
     gates = []
     for name in comparison.tasks:
         task, zero = track.tasks[name], comparison.ranges[name][0]
         gate, label = ("passed" if task.passes_gate(zero) else "FAILED", task.label) if name in TASKS else ("", "")
-        gates.append([name, label, f"{task.expert:g}", f"{zero:.3f}", gate])
+        gaps = [gap(comparison, name, twin.name, one.name) for twin, one in pairs]
+        gates.append([name, label, f"{task.expert:g}", f"{zero:.3f}", gate, *gaps])
     columns = {"task": False, "measures": False, "expert": True, "`none`": True, "gate": False}
+    columns |= {f"gap of `{one.name}`": True for _, one in pairs}
+    if pairs:
+        lines += [
+            "The observability gap is the mean normalised score in the fully observable twin of a task less that in the task.",
+            "",
+        ]
     return "\n".join([*lines, *tables.markdown(columns, gates)]) + "\n"
+
+
+def gap(comparison: Comparison, task: str, twin: str, agent: str) -> str:
+    """What the fully observable twin of a task adds to an agent's mean normalised score; empty if runs are missing."""
+    means = [comparison.mean(name, task) if name in comparison.scores else None for name in (twin, agent)]
+    return "" if None in means else f"{means[0] - means[1]:.2f}"
 
 
 def longer_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -455,7 +477,7 @@ def longer_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     named = [(compare.of_row(one, Path()).agent, one) for one in rows]
 
     def means(name: str, task: str) -> str:
-        own = [one for agent, one in named if (agent, one["task"]) == (name, task)]
+        own = [one for agent, one in named if (agent, one["task"]) == (name, task) and one["longer"] is not None]
         return " → ".join(f"{statistics.mean(one[key] for one in own):.2f}" for key in ("score", "longer") if own)
 
     shown = [[name, *(means(name, task.name) for task, _ in versions)] for name in dict.fromkeys(n for n, _ in named)]
