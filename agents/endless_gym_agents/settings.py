@@ -87,7 +87,7 @@ class Environment:
 
     @property
     def own_wrappers(self) -> tuple[str, ...]:
-        """The wrappers that are not the package's."""
+        """The wrappers that change more than the form of observations: your own, and that of fully observable twins."""
         return tuple(wrapper for wrapper in self.wrapper if wrapper not in (VECTORS, ONE_HOT))
 
     def fitted(self, described: Spec, vectors: str = VECTORS) -> Environment:

@@ -73,9 +73,11 @@ if sys.argv[2] == "page":
             except urllib.error.HTTPError as refused:
                 is_page &= refused.code == 403
         server.terminate()
-    while not Path("opened").exists():
+    end = time.monotonic() + 60
+    while not Path("opened").exists() and time.monotonic() < end:
         time.sleep(0.01)
-    if not is_page or server.returncode or Path("opened").read_text() != f"{url}\n":
+    opened = Path("opened").read_text() if Path("opened").exists() else ""
+    if not is_page or server.returncode or opened != f"{url}\n":
         sys.exit(f"`endless play --open` must serve the page and open it, got {url} and status {server.returncode}")
     command = [f"{sys.prefix}/bin/endless", "play", "popgym-RepeatFirstEasy-v0"]
     refused = subprocess.run(command, capture_output=True, text=True, timeout=60)

@@ -7,6 +7,7 @@ import dataclasses
 import importlib.util
 import json
 import os
+import re
 import select
 import signal
 import sys
@@ -145,6 +146,11 @@ def flags(values: Mapping[str, Any]) -> list[str]:
 def assignments(values: Mapping[str, Any]) -> tuple[str, ...]:
     """Values by name, each as NAME=VALUE with a JSON value, as `--environment.option` takes them."""
     return tuple(f"{name}={json.dumps(value)}" for name, value in values.items())
+
+
+def folder_name(env: str) -> str:
+    """An environment's id as a folder, without the `?` and `&` of arguments, which a shell reads otherwise."""
+    return re.sub("[?&]", "_", env)
 
 
 def check_installed(user: str, package: str, extra: str = "train") -> None:

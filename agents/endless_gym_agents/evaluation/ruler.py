@@ -67,7 +67,7 @@ class Task:
         return chosen | (popgym if self.env.startswith("popgym") else {})
 
     def twin(self) -> tuple[str, dict[str, Any]] | None:
-        """Environment id and flags of the fully observable task; None if there is none."""
+        """Environment id and flags of the fully observable task; None if there is none. A labyrinth's lacks the position."""
         described = spec(self.env)
         states = {"environment.wrapper": [STATES]} if described.markov_state else None
         changed = dict(self.observable or states or {})
@@ -86,6 +86,16 @@ def _mayhem(
 
 
 _OPEN = ("show_origin=true", "show_goal=true")
+#: One coin after the other, each shown for six steps, without spotlights; large, so that small agents learn it quickly.
+_COIN = (
+    "initial_spawns=0",
+    "spawn_interval=1000000000",
+    "agent_visible=true",
+    "show_last_action=false",
+    "coin_scale=0.6",
+    "agent_scale=0.375",
+    "max_steps=256",
+)
 _LATE = "command_count=[1]", "command_show_delay=[20]"
 
 #: The tasks. The numbers of experts and random actions are those that the program prints.
@@ -108,6 +118,16 @@ TASKS = {
         Task("count-recall", "capacity", "popgym-CountRecallEasy-v0", 1.0, -0.9274),
         Task("autoencode", "capacity", "popgym-AutoencodeEasy-v0", 1.0, -0.4895),
         Task("labyrinth", "spatial", "popgym-LabyrinthExploreEasy-v0", 0.9694, -0.3453),
+        Task(
+            "moving-coin",
+            "rewriting",
+            "Endless-SearingSpotlights-v0",
+            5.8375,
+            0.1119,
+            _COIN,
+            ("Endless-SearingSpotlights-v0", (*_COIN, "agent_speed=2")),
+            {"environment.option": [*_COIN, "coins_visible=true"]},
+        ),
     )
 }
 

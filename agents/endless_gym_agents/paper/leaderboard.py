@@ -226,7 +226,7 @@ def _task(given: Any, where: str) -> Task:
     one = _checked(given, "env", ("name", "options", "zero", "expert", "observable"), f"{where}, tasks")
     try:
         env = spec(one["env"]).full_id
-        name, options = _named(one.get("name", env), where), tuple(one.get("options", ()))
+        name, options = _named(one.get("name", re.sub("[?&,]", "_", env)), where), tuple(one.get("options", ()))
         task = Task(name, "object", env, 0.0, 0.0, options, observable=one.get("observable"))
         return dataclasses.replace(task, expert=float(one.get("expert") or ruler.mean_return(task, expert=True)))
     except ValueError as error:
@@ -463,8 +463,9 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
 
 def gap(comparison: Comparison, task: str, twin: str, agent: str) -> str:
     """What the fully observable twin of a task adds to an agent's mean normalised score; empty if runs are missing."""
-    means = [comparison.mean(name, task) if name in comparison.scores else None for name in (twin, agent)]
-    return "" if None in means else f"{means[0] - means[1]:.2f}"
+    means = [comparison.mean(name, task) for name in (twin, agent) if name in comparison.scores]
+    known = [mean for mean in means if mean is not None]
+    return f"{known[0] - known[1]:.2f}" if len(known) == 2 else ""
 
 
 def longer_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -517,16 +518,21 @@ def execute(arguments: LeaderboardArguments) -> None:
             name = f"{task.name} {entry.name} {size}"
             spent = {"tuning_core_seconds": sum(one["core_seconds"] for one in tuning["trials"])} if tuning else {}
             runs[name] = track.run(task, entry, size, chosen)
-            named[name] = runs[name][0], {"agent": entry.name, "size": size, "task": task.name} | spent
+            named[name] = (
+                runs[name][0],
+                entry.observable,
+                {"agent": entry.name, "size": size, "task": task.name} | spent,
+            )
     torch.set_num_threads(1)
     jobs, failure = trained(track, "runs", runs, arguments.seeds or track.seeds, arguments)
     rows = {tuple(one[key] for key in KEYS): one for one in data["rows"]}
     done: dict[str, list[tuple[float, Job]]] = {}
     for job in jobs:
-        task, about = named[job.run.name]
+        task, observable, about = named[job.run.name]
         found = about | row(job, task)
         rows[tuple(found[key] for key in KEYS)] = found
-        done.setdefault(task.name, []).append((found["score"], job))
+        if not observable:
+            done.setdefault(task.name, []).append((found["score"], job))
     folder.mkdir(parents=True, exist_ok=True)
     every = [rows[key] for key in sorted(rows, key=str)]
     comparison = compared(track, every, results)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import json
 import logging
+import shlex
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -217,7 +218,7 @@ class Trials:
 
         optuna.logging.set_verbosity(logging.ERROR)
         self.arguments, self.console, base = arguments, console, arguments.settings
-        self.folder = Path(arguments.folder or f"searches/{base.env}/{base.agent_name}")
+        self.folder = Path(arguments.folder or f"searches/{command.folder_name(base.env)}/{base.agent_name}")
         self.end = time.monotonic() + (60 * arguments.minutes if arguments.minutes else float("inf"))
         self.space: Space = space(base, arguments.parameters)
         (self.folder / LOCKS).mkdir(parents=True, exist_ok=True)
@@ -363,7 +364,7 @@ class Trials:
             found = {"reward": done[0].value, "trial": done[0].number, "settings": best, "trials": trials}
             atomic.write(self.folder / BEST, json.dumps(found, indent=1) + "\n")
             settings, changed = self.arguments.settings, self.changed(done[0].params)
-            start = f"--env {settings.env} --preset {settings.preset}"
+            start = f"--env {shlex.quote(settings.env)} --preset {settings.preset}"
             start += "" if "--agent" in changed else f" --agent {settings.agent}"
             self.console.print(
                 f"the best settings are in {self.folder / BEST}; as flags, in addition to your own:", soft_wrap=True

@@ -6,7 +6,6 @@ import contextlib
 import fcntl
 import itertools
 import os
-import re
 import socket
 import time
 import warnings
@@ -14,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from endless_gym.program.printable import printable
-from endless_gym_agents.common import atomic
+from endless_gym_agents.common import atomic, command
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training.logs import PROGRESS
@@ -77,8 +76,7 @@ def _new_folder(settings: Settings) -> Path:
     """Make the folder of a run without a given one; runs that start in the same second get different folders."""
     name = f"{settings.agent_name}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     for suffix in itertools.chain([""], (f"-{number}" for number in itertools.count(2))):
-        # A shell reads the `?` and `&` of an id with arguments otherwise.
-        run = Path("runs", re.sub("[?&]", "_", settings.env), name + suffix)
+        run = Path("runs", command.folder_name(settings.env), name + suffix)
         with contextlib.suppress(FileExistsError):
             run.mkdir(parents=True)
             break

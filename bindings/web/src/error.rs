@@ -14,6 +14,8 @@ pub enum WebError {
     Request(serde_json::Error),
     #[error("seed must be an integer, 0 to {}, got `{given}`", u64::MAX)]
     Seed { given: String },
+    #[error("the page plays environments without arguments, got `{id}`")]
+    Arguments { id: &'static str },
     #[error("there is no episode; start one first")]
     NoGame,
     #[error("there is no wall; start one first")]

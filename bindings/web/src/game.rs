@@ -63,11 +63,15 @@ impl Game {
         seed: Option<u64>,
         script: Option<(Trace, usize)>,
     ) -> Result<Self, WebError> {
+        let spec = registry.spec(id)?;
+        if registry.specs().all(|known| known.id != spec.id) {
+            return Err(WebError::Arguments { id: spec.id });
+        }
         let config = PoolConfig::new(id, 1)
             .options(ResetOptions::Shared(options.clone()))
             .autoreset(Autoreset::Disabled)
             .seeding(Seeding::Continue { seed: Some(0) })
-            .features(!registry.spec(id)?.features.is_empty());
+            .features(!spec.features.is_empty());
         let pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let blocks = zeroed(pool.layout().blocks());
         let rgba = pool.spec().shown().map_or(0, |frame| frame.width * frame.height * 4);
@@ -77,7 +81,7 @@ impl Game {
             agent_memory: None,
             clues: Clues::new(pool.spec()),
             action: vec![0; pool.spec().action_space.width()],
-            recorder: Recorder::new(id, &options),
+            recorder: Recorder::new(spec.id, &options),
             pool,
             blocks,
             options,

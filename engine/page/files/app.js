@@ -99,7 +99,9 @@ class App {
 
   /** Says why there is no wall, and plays the environment alone. */
   #noWall(error) {
-    if (!this.wall.state) this.start({ id: $("environment").value, options: {}, seed: randomSeed() });
+    const wanted = $("environment").value;
+    const id = this.specs.some((spec) => spec.id === wanted) ? wanted : (this.play.state?.id ?? this.first);
+    if (!this.wall.state) this.start({ id, options: {}, seed: randomSeed() });
     say(error.message, "environment");
   }
 

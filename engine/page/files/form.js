@@ -70,7 +70,7 @@ export class ParameterForm {
     const id = `parameter-${name}`;
     const input = make("input", { id, name, autocomplete: "off", spellcheck: false });
     if (type === "bool") Object.assign(input, { type: "checkbox", checked: (text ?? initial) === "true" });
-    else Object.assign(input, { value: text ?? initial, inputMode: type === "int_list" ? "" : "decimal" });
+    else Object.assign(input, { value: text ?? initial, inputMode: ["int", "float"].includes(type) ? "decimal" : "" });
     const hint = make("p", { className: "hint", id: `${id}-hint` }, `${description} Default ${initial}; ${allowed}.`);
     const error = make("p", { className: "error", id: `${id}-error` });
     input.setAttribute("aria-describedby", `${hint.id} ${error.id}`);

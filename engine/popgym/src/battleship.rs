@@ -15,7 +15,7 @@ use crate::pictures::{self, PICTURE};
 
 const ARGUMENTS: &[Parameter] = &[
     Parameter::int("board_size", 10, 1, ROWS as i64, "rows and columns of the board"),
-    Parameter::list("ship_sizes", &[2, 3, 3, 4], 1, ROWS as i64, "squares of each ship"),
+    Parameter::list("ship_sizes", &[2, 3, 3, 4], 1, ROWS as i64, "squares of each of at most 8 ships"),
 ];
 /// The largest board's size.
 const ROWS: usize = 20;

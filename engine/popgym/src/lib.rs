@@ -1,6 +1,6 @@
 //! The environments of POPGym (Morad et al., ICLR 2023), bit for bit as the Python package `popgym` 1.0.7 plays them.
 //!
-//! Each family is a module with a table of its ids. What pools and programs use is [`popgym`]; the rules are public for benchmarks
+//! Each family is a module, which defines its ids and their arguments. What pools and programs use is [`popgym`]; the rules are public for benchmarks
 //! and may change in any version.
 
 #![deny(unsafe_code)]

@@ -45,7 +45,7 @@ class Job:
     @property
     def folder(self) -> Path:
         """Folder of the run, shared by all experiments that contain the run."""
-        return self.out / "runs" / self.run.env / self.run.name / f"seed-{self.seed}"
+        return self.out / "runs" / command.folder_name(self.run.env) / self.run.name / f"seed-{self.seed}"
 
     @property
     def title(self) -> str:

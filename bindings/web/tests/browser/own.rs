@@ -110,6 +110,11 @@ fn popgym_is_played_by_keys_and_by_touch_to_the_end() {
             assert!(picture(&mut browser) == first, "{what}: another episode");
         }
     }
+    browser.load("about:blank");
+    browser.load(&format!("{}#env=popgym-RepeatPreviousEasy-v0%3Fk%3D2&seed=7", server.url()));
+    browser.wait("globalThis.endless && !document.getElementById('message').hidden");
+    let said = text(&mut browser, "message");
+    assert_eq!(said, "the page plays environments without arguments, got `popgym-RepeatPreviousEasy-v0?k=2`");
     assert_eq!(browser.complaints, Vec::<String>::new());
 }
 

@@ -7,7 +7,7 @@ use thiserror::Error;
 /// Maximum number of values in a list.
 const MAX_LIST: usize = 4096;
 
-/// Type, default and limits of a reset parameter.
+/// Type, default and limits of a reset parameter, or of an argument of an id.
 #[derive(Clone, Copy, Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum ParameterKind {
@@ -34,7 +34,7 @@ pub enum ParameterKind {
         /// Largest allowed value.
         max: f64,
     },
-    /// A list of 1 to 4096 integers, from which each episode draws one.
+    /// A list of 1 to 4096 integers. Of a reset parameter, each episode draws one.
     IntList {
         /// Default.
         default: &'static [i64],
@@ -88,7 +88,7 @@ impl Parameter {
         Parameter::float(name, default, -MAX_REWARD, MAX_REWARD, description)
     }
 
-    /// A list of integers in `min..=max`, from which each episode draws one.
+    /// A list of integers in `min..=max`. Of a reset parameter, each episode draws one.
     pub const fn list(
         name: &'static str,
         default: &'static [i64],
@@ -154,8 +154,11 @@ impl Parameter {
 
     /// The argument with another value: JSON text, where words need no quotes and lists no brackets.
     pub(super) fn with_default(self, text: &str) -> Result<Self, ParameterError> {
-        let is_list = matches!(self.kind, ParameterKind::IntList { .. }) && !text.starts_with('[');
-        let json = if is_list { serde_json::from_str(&format!("[{text}]")) } else { serde_json::from_str(text) };
+        let json = match self.kind {
+            ParameterKind::Choice { .. } => Ok(text.into()),
+            ParameterKind::IntList { .. } if !text.starts_with('[') => serde_json::from_str(&format!("[{text}]")),
+            _ => serde_json::from_str(text),
+        };
         let wrong =
             |_| ParameterError::Argument { name: self.name, value: text.to_owned(), allowed: self.requirement() };
         let kind = match (self.kind, self.parse(&json.unwrap_or_else(|_| text.into())).map_err(wrong)?) {

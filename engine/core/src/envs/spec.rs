@@ -1,5 +1,6 @@
 //! The specification of an environment id: spaces, reset parameters, info columns.
 
+use std::collections::HashSet;
 use std::fmt;
 
 use serde::Serialize;
@@ -405,7 +406,7 @@ impl EnvSpec {
     ///
     /// [`ParameterError`] if a name is unknown, or a value has the wrong type or is out of range.
     pub fn with_arguments(&self, given: &str) -> Result<EnvSpec, ParameterError> {
-        let mut arguments = self.arguments.to_vec();
+        let (mut arguments, mut names) = (self.arguments.to_vec(), HashSet::new());
         for argument in given.split('&').filter(|argument| !argument.is_empty()) {
             let (name, value) = argument.split_once('=').unwrap_or((argument, ""));
             let known = arguments.iter_mut().find(|known| known.name == name);
@@ -417,6 +418,10 @@ impl EnvSpec {
                     known => known.iter().map(|known| known.name).collect::<Vec<_>>().join(", "),
                 },
             })?;
+            if !names.insert(name) {
+                let (value, allowed) = (value.to_owned(), "given once".to_owned());
+                return Err(ParameterError::Argument { name: known.name, value, allowed });
+            }
             *known = known.with_default(value)?;
         }
         let texts =
@@ -437,7 +442,7 @@ impl EnvSpec {
 pub struct UnknownEnvironment {
     /// The given id.
     pub id: String,
-    /// All known ids, separated by commas.
+    /// All known ids, separated by commas; empty if only the arguments of `id` are wrong.
     pub known: String,
     /// What is wrong with the arguments of a known id.
     pub problem: Option<String>,
@@ -448,7 +453,7 @@ impl UnknownEnvironment {
     /// those that contain it, or the one most like it.
     pub fn likely(&self) -> Option<String> {
         const MOST: usize = 6;
-        let given = self.id.to_lowercase();
+        let given = self.id.split('?').next().unwrap_or_default().to_lowercase();
         let known = || self.known.split(", ").map(|known| (known, known.to_lowercase()));
         let is_version = |rest: &str| rest.strip_prefix("-v").is_some_and(|rest| rest.parse::<u32>().is_ok());
         let is_named = |lower: &str| lower.strip_prefix(&given).is_some_and(is_version);
@@ -489,6 +494,7 @@ mod tests {
     fn a_name_stands_for_its_ids() {
         for (given, likely) in [
             ("maze", Some("Maze-v0")),
+            ("maze?size=9", Some("Maze-v0")),
             ("Maze-Gird-v0", Some("Maze-Grid-v0")),
             ("p-Count", Some("p-CountEasy-v0 or p-CountHard-v0")),
             ("counthard", Some("p-CountHard-v0")),

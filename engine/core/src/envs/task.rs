@@ -100,7 +100,7 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
     }
 
     /// The typed reset parameters. `given` is complete with the [`arguments`](EnvSpec::arguments) of the id, every value is within its
-    /// limits, and its [`id`](ResetParameters::id) says which of several ids is played.
+    /// limits, and its [`id`](ResetParameters::id) up to a `?` says which of several ids is played.
     fn parameters(given: &ResetParameters) -> Self::Parameters;
 
     /// Seeds the generators that the rules keep themselves, before the reset of an episode that has a seed. Rules that only draw
