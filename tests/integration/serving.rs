@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::process::Stdio;
-use std::thread::available_parallelism;
+use std::thread::{self, available_parallelism};
 use std::time::{Duration, Instant};
 
 use crate::support::place::Place;
@@ -345,15 +345,25 @@ fn status_shows_engines_and_their_processes() {
     let mut readings = BufReader::new(lines.0.stdout.take().unwrap()).lines();
     let mut next = || serde_json::from_str::<Json>(&readings.next().unwrap().unwrap()).unwrap()[0].clone();
     assert_eq!(next()["mean_length"], Json::Null);
-    wait_until("an episode ends", || {
+    let mut shown = BufReader::new(tables.0.stdout.take().unwrap());
+    let seen = thread::spawn(move || {
+        let mut said = String::new();
+        while !said.contains("\nmean return ") {
+            assert!(shown.read_line(&mut said).unwrap() > 0, "{said}");
+        }
+        (shown, said)
+    });
+    wait_until("both see an episode end", || {
         (0..20).for_each(|_| drop(step(&mut trainer, 0)));
         let reading = next();
-        reading["mean_return"].is_number() && reading["mean_length"].as_f64().unwrap() > 1.0
+        let is_seen = reading["mean_return"].is_number() && reading["mean_length"].as_f64().unwrap() > 1.0;
+        is_seen && seen.is_finished()
     });
     ended(engine, Signal::INT);
     assert!(lines.wait().success() && tables.wait().success());
-    let tables = tables.output();
-    assert!(tables.contains("\nmean return ") && tables.ends_with("\nthe engine has ended\n"), "{tables}");
+    let (mut shown, mut said) = seen.join().unwrap();
+    shown.read_to_string(&mut said).unwrap();
+    assert!(said.ends_with("\nthe engine has ended\n"), "{said}");
 }
 
 /// Sends a request and returns the answer, head and body.

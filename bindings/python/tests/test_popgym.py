@@ -327,7 +327,7 @@ def test_the_original_s_arguments_are_those_of_an_id() -> None:
         (popgym.VelocityOnlyCartPole(sutton_barto_reward=True), "VelocityOnlyCartpoleEasy-v0?sutton_barto_reward=true"),
         (gymnasium.make("EndlessGym/popgym-RepeatPreviousEasy-v0", k=3, num_decks=1), "RepeatPreviousEasy-v0?k=3"),
         (gymnasium.make_vec("EndlessGym/popgym-RepeatPreviousEasy-v0", 2, k=3), "RepeatPreviousEasy-v0?k=3"),
-        (endless_gym.Env("EndlessGym/popgym-RepeatPreviousEasy-v0?k=3&k=4"), "RepeatPreviousEasy-v0"),
+        (endless_gym.Env("EndlessGym/popgym-RepeatPreviousEasy-v0?k=4"), "RepeatPreviousEasy-v0"),
     ]:
         own: Any = env.unwrapped
         described = own._described if isinstance(env, gymnasium.vector.VectorEnv) else own._spec
@@ -337,6 +337,10 @@ def test_the_original_s_arguments_are_those_of_an_id() -> None:
     assert remade._spec.id == "popgym-RepeatPreviousEasy-v0?k=3" and len(endless_gym.all_specs()) == 58
     for wrong, message in [
         (lambda: popgym.RepeatPrevious(k=0), "argument `k` must be an integer, 1 to 3275, got 0"),
+        (
+            lambda: endless_gym.Env("EndlessGym/popgym-RepeatPreviousEasy-v0?k=3&k=4"),
+            "argument `k` must be given once, got 4",
+        ),
         (lambda: popgym.RepeatPrevious(k=52), "argument `k` must be less than the number of cards, 52, got 52"),
         (lambda: popgym.RepeatPrevious(num_decks=64), "argument `num_decks` must be an integer, 1 to 63, got 64"),
         (lambda: popgym.RepeatPrevious(k="a&b"), "argument `k` must be an integer, 1 to 3275, got a"),
