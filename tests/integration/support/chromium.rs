@@ -74,6 +74,12 @@ impl Chromium {
         assert!(answer["errorText"].is_null(), "{url}: {}", answer["errorText"]);
     }
 
+    /// Loads the page again, and waits until it is there: Chromium may never answer what a page is asked while it leaves.
+    pub fn reload(&mut self) {
+        self.call("Page.reload", &json!({}));
+        self.read_until(|event| event["method"] == "Page.loadEventFired");
+    }
+
     /// The value of an expression in the page. Waits if it is a promise.
     pub fn value(&mut self, expression: &str) -> Json {
         let arguments = json!({"expression": expression, "awaitPromise": true, "returnByValue": true});
@@ -179,15 +185,20 @@ impl Chromium {
             message["sessionId"] = json!(session);
         }
         self.to.write_all(format!("{message}\0").as_bytes()).expect("Chromium listens");
+        let answer = self.read_until(|answer| answer["id"] == message["id"]);
+        assert!(answer["error"].is_null(), "{method}: {}", answer["error"]);
+        answer["result"].clone()
+    }
+
+    /// Reads messages until that one.
+    fn read_until(&mut self, is_it: impl Fn(&Json) -> bool) -> Json {
         loop {
             let mut bytes = Vec::new();
             self.from.read_until(0, &mut bytes).expect("Chromium answers");
-            let end = bytes.pop();
-            assert_eq!(end, Some(0), "Chromium ended during {method}");
+            assert_eq!(bytes.pop(), Some(0), "Chromium ended");
             let answer: Json = serde_json::from_slice(&bytes).expect("Chromium answers with JSON");
-            if answer["id"] == self.calls {
-                assert!(answer["error"].is_null(), "{method}: {}", answer["error"]);
-                return answer["result"].clone();
+            if is_it(&answer) {
+                return answer;
             }
             self.note(&answer);
         }
