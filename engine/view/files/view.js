@@ -33,9 +33,9 @@ class View {
   /** Shows the server's default engine, or the list. */
   async start() {
     this.given = (await engines()).service ?? "";
+    addEventListener("popstate", () => this.show(this.#named()));
     this.show(this.#named());
     await this.#list();
-    addEventListener("popstate", () => this.show(this.#named()));
     // Listing costs more than reading one engine's status, so refresh only while the list is visible.
     setInterval(() => this.service === "" && !document.hidden && this.#list().catch(() => {}), 2000);
     // The times of a lost engine go on.
