@@ -214,8 +214,13 @@ def make(settings: Settings, num_envs: int, num_threads: int | None = None, **ar
         ValueError: As for `make_vec` and `wrap`.
     """
     wanted = settings.environment
-    known = {"options": settings.options(), "observation": wanted.observation, "state": wanted.shows_state}
-    with make_vec(settings.env, num_envs, num_threads, **{"autoreset": "same_step"} | known | arguments) as envs:
+    known = {
+        "options": settings.options(),
+        "observation": wanted.observation,
+        "state": wanted.shows_state,
+        "autoreset": "same_step",
+    }
+    with make_vec(settings.env, num_envs, num_threads, **known | arguments) as envs:
         yield wrap(settings, envs)
 
 

@@ -90,8 +90,20 @@ def make_vec(
         ValueError: An argument is out of its range, or both `copy` and `pin_memory` are given.
     """
     given = checked_arguments(
-        *(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames),
-        *(independent_episodes, state, first_env, total_envs),
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+        state,
+        first_env,
+        total_envs,
     )
     allocate = None if cuda_to_pin(pin_memory, copy) is None else page_locked_bytes()
     pools = given.described.native.Pools([json_text(config) for config in given.pools], given.num_threads, allocate)

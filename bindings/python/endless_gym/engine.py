@@ -179,8 +179,20 @@ def serve(  # noqa: D417
         RuntimeError: The engine cannot start; the message says why.
     """
     given = checked_arguments(
-        *(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames),
-        *(independent_episodes, state, first_env, total_envs),
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+        state,
+        first_env,
+        total_envs,
     )
     timeout = checked_timeout(timeout)
     checked_view(render_mode, view, modes_of(given.described, VECTOR_MODES))

@@ -115,6 +115,15 @@ macro_rules! row_name {
     };
 }
 
+macro_rules! presence {
+    (required) => {
+        true
+    };
+    (optional) => {
+        false
+    };
+}
+
 /// Defines the enum of a table, with the table as its documentation.
 macro_rules! section_table {
     (
@@ -161,7 +170,7 @@ macro_rules! section_table {
 
             fn is_required(self) -> bool {
                 match self {
-                    $($table::$variant => matches!(stringify!($presence), "required"),)*
+                    $($table::$variant => presence!($presence),)*
                 }
             }
         }
