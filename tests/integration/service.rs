@@ -7,7 +7,7 @@ use crate::support::foreign::{self, Foreign, RequestHeader};
 use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::{TIMEOUT, unshare};
-use crate::support::service::{ID, assert_error, assert_rejected, play, send, set_role, step, try_step};
+use crate::support::service::{ID, assert_error, assert_rejected, observed, play, send, set_role, step, try_step};
 use endless_gym::batch::Block;
 use endless_gym::envs::{ActionError, ActionSpace};
 use endless_gym::memory_gym;
@@ -143,7 +143,7 @@ fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
     let mut observer = Observer::connect(&config, 0).unwrap();
     assert!(observer.newest().unwrap().is_none());
     play(&mut trainer, 0, 10);
-    let seen = observer.newest().unwrap().unwrap();
+    let seen = observed(&mut observer, 11);
     assert_eq!(seen.step(), 11);
     // An observer that holds batches reaches its own limit and does not affect the trainer.
     let mut held = vec![seen];

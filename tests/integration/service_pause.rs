@@ -6,7 +6,7 @@ use std::time::Instant;
 use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::TIMEOUT;
-use crate::support::service::{ID, reset, step};
+use crate::support::service::{ID, observed, reset, step};
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{Engine, EngineStatus, Observer, ServiceError, Trainer};
@@ -45,7 +45,7 @@ fn the_engine_writes_to_one_buffer_while_observers_are_paused() {
         }
         let expected = step(&mut trainer, 0);
         for observer in &mut observers {
-            let seen = observer.newest().unwrap().unwrap();
+            let seen = observed(observer, expected.step());
             assert_eq!((seen.step(), observer.step()), (expected.step(), Some(expected.step())));
             assert_eq!(seen.batch().observation(), expected.batch().observation());
         }
@@ -63,9 +63,9 @@ fn a_lease_is_valid_while_its_observer_is_paused() {
     let observation = lease.batch().observation().to_vec();
     observer.pause();
     assert!(!observer.is_paused(), "the pause begins with the end of the lease");
-    let newest = (0..20).map(|_| step(&mut trainer, 0).step()).last();
+    let newest = (0..20).map(|_| step(&mut trainer, 0).step()).last().unwrap();
     assert!(lease.batch().observation() == observation);
-    assert_eq!(observer.newest().unwrap().map(|lease| lease.step()), newest);
+    assert_eq!(observed(&mut observer, newest).step(), newest);
     observer.pause();
     drop(lease);
     assert!(observer.is_paused());
@@ -98,7 +98,7 @@ fn a_paused_observer_keeps_its_slot() {
     let mut trainer = started(&place);
     assert!(first.newest().unwrap().is_none());
     let sent = step(&mut trainer, 0).step();
-    assert_eq!(first.newest().unwrap().map(|lease| lease.step()), Some(sent));
+    assert_eq!(observed(&mut first, sent).step(), sent);
     drop(third);
 }
 
@@ -118,7 +118,7 @@ fn an_idle_engine_resends_the_last_batch_to_a_resumed_observer() {
             expected.step_all(1);
         }
         let sent = last.as_ref().unwrap().step();
-        assert_eq!(other.newest().unwrap().map(|lease| lease.step()), Some(sent));
+        assert_eq!(observed(&mut other, sent).step(), sent);
         // The engine sends the same chunk again, unless the trainer holds it.
         let held = last.filter(|_| round % 2 == 0);
         let begin = Instant::now();

@@ -9,7 +9,7 @@ use crate::faulty_environments;
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{
-    BatchLease, ConnectConfig, Engine, EngineConfig, Namespace, Observers, Rejection, ServiceError, Trainer,
+    BatchLease, ConnectConfig, Engine, EngineConfig, Namespace, Observer, Observers, Rejection, ServiceError, Trainer,
 };
 
 use super::meeting;
@@ -77,6 +77,11 @@ pub fn step(trainer: &mut Trainer, group: usize) -> BatchLease {
 pub fn try_step(trainer: &mut Trainer, group: usize) -> Result<BatchLease, ServiceError> {
     trainer.send_with(group, |actions| actions.fill(1))?;
     trainer.receive(group, TIMEOUT)
+}
+
+/// The batch of a step that the trainer has received: the engine delivers it to the observers one after the other.
+pub fn observed(observer: &mut Observer, step: u64) -> BatchLease {
+    std::iter::repeat_with(|| observer.next(TIMEOUT).unwrap()).find(|lease| lease.step() >= step).unwrap()
 }
 
 /// Resets a group and steps it.
