@@ -114,9 +114,28 @@ TASKS = {
         Task(
             "repeat-first", "object", "popgym-RepeatFirstEasy-v0", 1.0, -0.4943, (), ("popgym-RepeatFirstMedium-v0", ())
         ),
+        Task(
+            "repeat-first-12",
+            "object",
+            "popgym-RepeatFirstEasy-v0?num_decks=12",
+            1.0,
+            -0.4988,
+            (),
+            ("popgym-RepeatFirstEasy-v0?num_decks=16", ()),
+        ),
         Task("repeat-previous", "sequential", "popgym-RepeatPreviousEasy-v0", 1.0, -0.4942),
+        Task(
+            "repeat-previous-8",
+            "sequential",
+            "popgym-RepeatPreviousEasy-v0?k=8",
+            1.0,
+            -0.4991,
+            (),
+            ("popgym-RepeatPreviousEasy-v0?k=8&num_decks=2", ()),
+        ),
         Task("count-recall", "capacity", "popgym-CountRecallEasy-v0", 1.0, -0.9274),
         Task("autoencode", "capacity", "popgym-AutoencodeEasy-v0", 1.0, -0.4895),
+        Task("mine-sweeper", "spatial", "popgym-MineSweeperEasy-v0", 0.7134, -0.2147),
         Task("labyrinth", "spatial", "popgym-LabyrinthExploreEasy-v0", 0.9694, -0.3453),
         Task(
             "moving-coin",

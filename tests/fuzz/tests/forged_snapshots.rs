@@ -12,9 +12,14 @@ use serde_json::{Map, Value as Json};
 /// Number of items of a forged list, more than any list gets by playing within a test.
 const MANY: usize = 100_000;
 
+/// The environments of Memory Gym, and one level of each of POPGym: the levels differ in numbers only.
+fn specs() -> impl Iterator<Item = &'static EnvSpec> {
+    registry().specs().filter(|spec| !spec.id.contains("Easy") && !spec.id.contains("Hard"))
+}
+
 #[test]
 fn long_lists_are_refused_or_played() {
-    for spec in registry().specs() {
+    for spec in specs() {
         let mut game = Game::new(spec, Seeding::Continue { seed: Some(3) }, Map::new());
         game.play(45);
         let mut content = game.content();
@@ -54,7 +59,7 @@ fn all_flags(spec: &EnvSpec) -> Map<String, Json> {
 
 #[test]
 fn extreme_numbers_are_refused_or_played() {
-    for (spec, seeding) in registry().specs().zip(seedings().into_iter().cycle()) {
+    for (spec, seeding) in specs().zip(seedings().into_iter().cycle()) {
         let (mut refused, mut played) = (0, 0);
         // The second time with every flag turned on.
         for (steps, options) in [(0, Map::new()), (45, all_flags(spec))] {
@@ -91,7 +96,7 @@ fn words() -> Vec<Vec<u8>> {
 #[test]
 fn changed_bytes_are_refused_or_played() {
     let (words, mut random) = (words(), Generator::from_seed(6));
-    for (spec, seeding) in registry().specs().zip(seedings().into_iter().cycle()) {
+    for (spec, seeding) in specs().zip(seedings().into_iter().cycle()) {
         let mut game = Game::new(spec, seeding, Map::new());
         game.play(9);
         let snapshot = game.snapshot();
