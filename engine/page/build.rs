@@ -1,4 +1,4 @@
-//! Compresses the files, and lists them for `include_bytes!`: the sources, and in a release build the engine if it has been built.
+//! Compresses the files, and lists them for `include_bytes!`: the sources, and in a release build the engines if they have been built.
 //! Tests do not depend on earlier builds.
 
 use std::fmt::Write as _;
@@ -12,11 +12,11 @@ use flate2::write::GzEncoder;
 fn main() -> io::Result<()> {
     let package = PathBuf::from(variable("CARGO_MANIFEST_DIR")?);
     let out = PathBuf::from(variable("OUT_DIR")?);
-    let (engine, files) = (package.join("built/engine.wasm"), package.join("files"));
     let is_release = variable("PROFILE")? == "release";
     println!("cargo::rerun-if-changed={}", if is_release { "." } else { "files" });
-    let mut paths: Vec<PathBuf> = fs::read_dir(files)?.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>()?;
-    paths.extend(Some(engine).filter(|engine| is_release && engine.exists()));
+    let folders = [Some("files"), is_release.then_some("built")].into_iter().flatten().map(|name| package.join(name));
+    let folders = folders.filter(|folder| folder.exists()).map(fs::read_dir).collect::<io::Result<Vec<_>>>()?;
+    let mut paths = folders.into_iter().flatten().map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
     paths.sort();
     let mut list = String::from("&[\n");
     for path in &paths {

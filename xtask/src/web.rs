@@ -6,6 +6,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use endless_gym_page::ENGINES;
 use flate2::Compression;
 use flate2::read::GzEncoder;
 
@@ -17,7 +18,8 @@ const TARGET: &str = "wasm32-unknown-unknown";
 pub const MISSING: &str = "Rust's standard library for wasm32-unknown-unknown; rustup target add wasm32-unknown-unknown, or on Debian \
     .ci/wasm-toolchain, which unpacks Debian's compiler under target/";
 
-/// Limit of the bytes of all compressed files that a browser downloads at first, without agents that the landing does not show.
+/// Limit of the bytes of all compressed files that a browser downloads at first: not those of POPGym, nor agents that the landing does
+/// not show.
 const LIMIT: u64 = 620_000;
 
 /// A compiler with the target's standard library, or with its sources.
@@ -74,23 +76,14 @@ pub fn folder() -> Result<PathBuf, String> {
 
 /// Builds the page. Fails if there is no compiler for WebAssembly, or if the page is too large.
 pub fn build() -> Result<(), String> {
-    // The manifest does not ask for a `cdylib`: cargo would then build one for every crate that depends on the library, under the same
-    // name.
-    let package = ["rustc", "--locked", "--release", "--package", "endless-gym-web", "--lib", "--crate-type", "cdylib"];
-    let mut cargo = cargo(&package);
-    // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
-    cargo.args(["--target", TARGET]).env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
-    cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
-    let built = Toolchain::find().ok_or(MISSING)?.set(&mut cargo)?;
-    run(&mut cargo)?;
-    let engine = built.join(TARGET).join("release/endless_gym_web.wasm");
-    let engine = fs::read(&engine).map_err(describe(&engine))?;
-    let files = endless_gym_page::files(&engine, |_| true);
+    let [memory_gym, popgym] = [engine("memory-gym")?, engine("popgym")?];
+    let engines: Vec<_> = ENGINES.into_iter().zip([&*memory_gym, &*popgym]).collect();
+    let files = endless_gym_page::files(&engines, |_| true);
     write(&folder()?, &files)?;
     let embedded = embedded();
-    // It is not rewritten unchanged, to avoid a rebuild.
-    if fs::read(embedded.join("engine.wasm")).ok().as_ref() != Some(&engine) {
-        write(&embedded, &[("engine.wasm", engine)])?;
+    // They are not rewritten unchanged, to avoid a rebuild.
+    if engines.iter().any(|(name, engine)| !fs::read(embedded.join(name)).is_ok_and(|bytes| bytes == *engine)) {
+        write(&embedded, &engines)?;
     }
     // Reading from memory does not fail.
     let compress = |bytes: &[u8]| io::copy(&mut GzEncoder::new(bytes, Compression::default()), &mut io::sink());
@@ -98,7 +91,9 @@ pub fn build() -> Result<(), String> {
     let app = files.iter().find(|(name, _)| *name == "app.js").map(|(_, bytes)| String::from_utf8_lossy(bytes));
     let is_named = |id: &str| app.as_ref().is_some_and(|app| app.contains(&format!("\"{id}\"")));
     let is_landing = |agent: &str| is_named(agent.trim_end_matches("-none"));
-    let first = files.iter().filter(|(name, _)| name.strip_suffix(".safetensors").is_none_or(is_landing));
+    let first = files
+        .iter()
+        .filter(|(name, _)| *name != ENGINES[1] && name.strip_suffix(".safetensors").is_none_or(is_landing));
     let compressed: u64 = first.flat_map(|(_, bytes)| compress(bytes)).sum();
     let index = folder()?.join("index.html");
     println!("    {} files, at first {compressed} bytes compressed, {}", files.len(), index.display());
@@ -108,7 +103,23 @@ pub fn build() -> Result<(), String> {
     Ok(())
 }
 
-/// The folder from which the program embeds the engine, `engine.wasm`.
+/// Builds the engine with the environments of a suite.
+fn engine(suite: &str) -> Result<Vec<u8>, String> {
+    // The manifest does not ask for a `cdylib`: cargo would then build one for every crate that depends on the library, under the same
+    // name.
+    let package = ["rustc", "--locked", "--release", "--package", "endless-gym-web", "--lib", "--crate-type", "cdylib"];
+    let mut cargo = cargo(&package);
+    cargo.args(["--no-default-features", "--features", suite, "--target", TARGET]);
+    // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
+    cargo.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
+    cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
+    let built = Toolchain::find().ok_or(MISSING)?.set(&mut cargo)?;
+    run(&mut cargo)?;
+    let engine = built.join(TARGET).join("release/endless_gym_web.wasm");
+    fs::read(&engine).map_err(describe(&engine))
+}
+
+/// The folder from which the program embeds the engines.
 fn embedded() -> PathBuf {
     workspace().join("engine/page/built")
 }
@@ -116,7 +127,7 @@ fn embedded() -> PathBuf {
 /// Builds the page and the program, and plays in a browser. Without a compiler for WebAssembly, the program embeds an engine that was
 /// built earlier, or that of a release.
 pub fn play(arguments: &[String]) -> Result<(), String> {
-    if Toolchain::find().is_some() || !embedded().join("engine.wasm").exists() {
+    if Toolchain::find().is_some() || !embedded().join(ENGINES[0]).exists() {
         build()?;
     }
     run(cargo(&["run", "--locked", "--release", "--bin", "endless", "--", "play", "--open"]).args(arguments))
@@ -162,7 +173,7 @@ fn build_own() -> Result<(), String> {
     run(page.env("CARGO_TARGET_DIR", folder.join("target")))
 }
 
-fn write(folder: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), String> {
+fn write(folder: &Path, files: &[(&str, impl AsRef<[u8]>)]) -> Result<(), String> {
     recreate(folder)?;
     files.iter().try_for_each(|(name, bytes)| {
         let path = folder.join(name);

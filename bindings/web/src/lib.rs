@@ -2,8 +2,8 @@
 //! environments.
 //!
 //! [`module!`] makes a library of the type `cdylib` the engine of a page with the environments of a registry. A crate with
-//! environments of its own depends on this one without its default features, one of which defines the engine with those of
-//! Memory Gym:
+//! environments of its own depends on this one without its default features; the features `memory-gym`, the default, and `popgym`
+//! define the engines with those of the suites:
 //!
 //! ```ignore
 //! #[cfg(target_arch = "wasm32")]
@@ -37,6 +37,9 @@ use request::{App, Request};
 
 #[cfg(feature = "memory-gym")]
 module!(Ok(endless_gym_memory_gym::memory_gym().clone()));
+
+#[cfg(all(feature = "popgym", not(feature = "memory-gym")))]
+module!(Ok(endless_gym_popgym::popgym().clone()));
 
 /// Defines the function that sets the environments of the page, those of `$registry`, a `Result<Registry, RegistryError>`.
 #[macro_export]

@@ -32,6 +32,9 @@ const LARGEST = 1e9;
 /** The environment of a page without a link, which an agent plays until the visitor starts. */
 const LANDING = "Endless-MortarMayhem-v0";
 
+/** Whether the page is that of POPGym, which has another engine. */
+const IS_POPGYM = location.search === "?popgym";
+
 /** The wall that the page shows unless the address names another. */
 const WALL = { wall: "all", count: "100", by: "expert" };
 
@@ -43,13 +46,19 @@ class App {
     this.play = new Play(engine, this.specs, { changed: (state) => this.#playing(state), report });
     this.hasLanding = this.specs.some((spec) => spec.id === LANDING);
     this.first = this.hasLanding ? LANDING : this.specs[0].id;
-    $("source").hidden = this.specs.every((spec) => questionOf(spec.id) === "");
+    // A page with environments of one's own has one engine.
+    const isMemoryGym = this.specs.every((spec) => questionOf(spec.id) !== "");
+    for (const id of ["suite", "source"]) $(id).hidden = !IS_POPGYM && !isMemoryGym;
+    if (IS_POPGYM) {
+      Object.assign($("suite"), { href: "./", textContent: "Memory Gym" });
+      Object.assign($("source").firstElementChild, { href: "https://arxiv.org/abs/2303.01859", textContent: "POPGym" });
+    }
     this.wall = new Wall(engine, this.specs, {
       changed: (wall) => this.#address(wallLink(wall)),
       play: (episode) => this.start(episode),
       report: (error) => this.#noWall(error),
     });
-    $("environment").append(...this.specs.map(({ id }) => new Option(id)));
+    $("environment").append(...this.specs.map(({ id }) => new Option(id.replace("popgym-", ""), id)));
     $("to-wall").parentElement.hidden = this.specs.every((spec) => !spec.shown);
     $("agent").hidden = this.specs.every((spec) => !this.play.agents.has(spec.id));
     this.#listen();
@@ -272,7 +281,7 @@ try {
 }
 
 try {
-  const app = new App(await Engine.load());
+  const app = new App(await Engine.load(IS_POPGYM ? "popgym.wasm" : "engine.wasm"));
   // For tests and for the browser's console.
   globalThis.endless = app;
   app.follow();

@@ -9,8 +9,9 @@ export class EngineError extends Error {}
 export class Engine {
   #wasm;
 
-  /** Loads the engine from the page's folder. */
-  static async load(url = new URL("engine.wasm", import.meta.url)) {
+  /** Loads the engine of that file in the page's folder. */
+  static async load(file) {
+    const url = new URL(file, import.meta.url);
     const response = await fetch(url).catch(() => ({ statusText: "no answer" }));
     if (!response.ok) {
       throw new EngineError(`The engine cannot be loaded (${url}: ${response.status ?? ""} ${response.statusText}). Load the page again; if this stays, its folder lacks the file.`);

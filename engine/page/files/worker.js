@@ -2,14 +2,14 @@
 
 const CACHE = `endless-gym-${VERSION}`;
 
-/** The end of the name of an agent's file. */
-const AGENT = ".safetensors";
+/** The files that are kept once they were chosen: agents, and the engine of POPGym. */
+const LATER = /\.safetensors$|\bpopgym\.wasm$/;
 
 self.addEventListener("install", (event) => {
   const fill = async () => {
     const cache = await caches.open(CACHE);
-    // Bypass the browser's HTTP cache, which may hold files of another version. Agents are kept once they were chosen.
-    await cache.addAll(["./", ...FILES.filter((file) => !file.endsWith(AGENT))].map((file) => new Request(file, { cache: "reload" })));
+    // Bypass the browser's HTTP cache, which may hold files of another version.
+    await cache.addAll(["./", ...FILES.filter((file) => !LATER.test(file))].map((file) => new Request(file, { cache: "reload" })));
     await self.skipWaiting();
   };
   event.waitUntil(fill());
@@ -32,7 +32,7 @@ self.addEventListener("fetch", (event) => {
     const known = await cache.match(event.request, { ignoreSearch: true });
     if (known) return known;
     const response = await fetch(event.request);
-    if (response.ok && event.request.url.endsWith(AGENT)) await cache.put(event.request, response.clone());
+    if (response.ok && LATER.test(event.request.url)) await cache.put(event.request, response.clone());
     return response;
   };
   event.respondWith(answer());

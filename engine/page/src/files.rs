@@ -7,7 +7,8 @@ use flate2::read::GzDecoder;
 /// Names and contents of the files, each compressed with gzip.
 pub const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
 
-const ENGINE: &str = "engine.wasm";
+/// The engine of the page, with the environments of Memory Gym or of a crate, and that of the page at `?popgym`.
+pub const ENGINES: [&str; 2] = ["engine.wasm", "popgym.wasm"];
 
 /// The service worker, which lacks the list of the files that it caches.
 const WORKER: &str = "worker.js";
@@ -34,11 +35,6 @@ pub fn decompress(file: &[u8]) -> Vec<u8> {
     GzDecoder::new(file).read_to_end(&mut bytes).map_or_else(|_| Vec::new(), |_| bytes)
 }
 
-/// The engine of the page, if it was built before this crate. Without it, the page cannot be played.
-pub fn engine() -> Option<Vec<u8>> {
-    file(ENGINE).map(decompress)
-}
-
 /// Whether an engine contains the text of an id. One that does not cannot have the environment.
 ///
 /// ```
@@ -49,21 +45,21 @@ pub fn names(engine: &[u8], id: &str) -> bool {
     engine.windows(id.len().max(1)).any(|part| part == id.as_bytes())
 }
 
-/// Names and contents of all files of a page with another engine, for any web server. `has_id` says whether the engine has an
-/// environment: agents of others are left out.
+/// Names and contents of all files of a page with these engines by their names, for any web server. `has_id` says whether they have
+/// an environment: agents of others are left out.
 ///
 /// ```
-/// let files = endless_gym_page::files(b"\0asm", |_| false);
+/// let files = endless_gym_page::files(&[("engine.wasm", b"\0asm")], |_| false);
 /// let (_, worker) = files.iter().find(|(name, _)| *name == "worker.js").unwrap();
 /// assert!(worker.starts_with(b"const VERSION = \""));
 /// ```
-pub fn files(engine: &[u8], has_id: impl Fn(&str) -> bool) -> Vec<(&'static str, Vec<u8>)> {
+pub fn files(engines: &[(&'static str, &[u8])], has_id: impl Fn(&str) -> bool) -> Vec<(&'static str, Vec<u8>)> {
     let is_kept = |name: &str| {
-        name != ENGINE
+        !ENGINES.contains(&name)
             && name.strip_suffix(AGENT).is_none_or(|agent| has_id(agent.strip_suffix(NO_MEMORY).unwrap_or(agent)))
     };
     let sources = FILES.iter().filter(|(name, _)| is_kept(name)).map(|(name, bytes)| (*name, decompress(bytes)));
-    let mut files: Vec<_> = sources.chain([(ENGINE, engine.to_vec())]).collect();
+    let mut files: Vec<_> = sources.chain(engines.iter().map(|(name, engine)| (*name, engine.to_vec()))).collect();
     let mut checksum = crc32fast::Hasher::new();
     files.iter().for_each(|(_, bytes)| checksum.update(bytes));
     let names: Vec<&str> = files.iter().map(|(name, _)| *name).filter(|name| *name != WORKER).collect();

@@ -42,13 +42,15 @@ impl PlayServer {
     /// [`ServerError::PageNotBuilt`] if this program was built without the page, [`ServerError::NotOnPage`] if its page does not have the
     /// environment, and [`ServerError::Port`] if the port is taken.
     pub fn bind(port: u16, id: &str) -> Result<Self, ServerError> {
-        check(files::engine().as_deref(), id)?;
+        let engines: Vec<_> = files::ENGINES.into_iter().filter_map(files::file).map(files::decompress).collect();
+        check(&engines, id)?;
         Ok(PlayServer { port: Port::local(port)? })
     }
 
     /// The address of an episode: an environment with reset parameters and a seed, or a random seed for `None`.
     pub fn url(&self, id: &str, options: &Map<String, Json>, seed: Option<u64>) -> String {
-        format!("{}#{}", self.port.url(), link(id, options, seed))
+        let suite = if id.starts_with("popgym-") { "?popgym" } else { "" };
+        format!("{}{suite}#{}", self.port.url(), link(id, options, seed))
     }
 
     /// Serves until the flag is set.
@@ -61,9 +63,12 @@ impl PlayServer {
     }
 }
 
-/// Checks that the page's engine has an environment.
-fn check(engine: Option<&[u8]>, id: &str) -> Result<(), ServerError> {
-    let is_on_page = files::names(engine.ok_or(ServerError::PageNotBuilt)?, id);
+/// Checks that one of the page's engines has an environment.
+fn check(engines: &[Vec<u8>], id: &str) -> Result<(), ServerError> {
+    if engines.is_empty() {
+        return Err(ServerError::PageNotBuilt);
+    }
+    let is_on_page = engines.iter().any(|engine| files::names(engine, id));
     is_on_page.then_some(()).ok_or_else(|| ServerError::NotOnPage { id: id.to_owned() })
 }
 
@@ -154,9 +159,9 @@ mod tests {
 
     #[test]
     fn an_environment_that_is_not_on_the_page_is_an_error_that_names_what_works() {
-        let engine = Some(b"\0asm MysteryPath-v0 ".as_slice());
-        assert!(check(engine, "MysteryPath-v0").is_ok());
-        for error in [check(engine, "popgym-RepeatFirstEasy-v0"), check(None, "MysteryPath-v0")] {
+        let engines = [b"\0asm MysteryPath-v0 ".to_vec(), b"\0asm popgym-PendulumEasy-v0 ".to_vec()];
+        assert!(["MysteryPath-v0", "popgym-PendulumEasy-v0"].into_iter().all(|id| check(&engines, id).is_ok()));
+        for error in [check(&engines, "TMaze-v0"), check(&[], "MysteryPath-v0")] {
             let message = error.unwrap_err().to_string();
             assert!(message.contains("`--terminal`") && message.contains("`endless page --out FOLDER`"), "{message}");
             assert!(!message.contains('\n'));

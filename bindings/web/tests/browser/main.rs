@@ -8,6 +8,7 @@ mod hands;
 mod landing;
 mod layout;
 mod own;
+mod popgym;
 mod server;
 mod speed;
 

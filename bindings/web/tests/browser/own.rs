@@ -1,15 +1,9 @@
-//! Tests the page with environments of one's own and of POPGym, those of `tests/own/lib.rs`, which `endless page` writes.
+//! Tests the page with environments of one's own, those of `tests/own/lib.rs`, which `endless page` writes.
 
-use serde_json::{Value as Json, json};
+use serde_json::json;
 
-use crate::chromium::Chromium;
 use crate::server::PageServer;
-use crate::{STATE, start, text, visit};
-
-/// Whether both canvases show the engine's pictures, which have several colours.
-const SHOWN: &str = "['observation', 'view'].every((id) => { const { width, height } = endless.play.spec.picture; \
-    const drawn = document.getElementById(id).getContext('2d').getImageData(0, 0, width, height).data; \
-    return endless.engine[id]({ width, height }).data.every((byte, i) => byte === drawn[i]) && new Set(new Uint32Array(drawn.buffer)).size > 1 })";
+use crate::{STATE, start, visit};
 
 #[test]
 #[ignore = "needs the built page and Chromium"]
@@ -19,10 +13,11 @@ fn environments_of_ones_own_are_played() {
     let text = |id: &str| format!("document.getElementById('{id}').innerText");
     // The first environment is shown, without trained agents, which are of other environments.
     visit(&mut browser, &server, "");
-    assert_eq!(browser.value(STATE)["id"], "popgym-AutoencodeEasy-v0");
+    assert_eq!(browser.value(STATE)["id"], "Small-v0");
     visit(&mut browser, &server, "env=Small-v0&seed=1");
     let shown = browser.value("['agent', 'action', 'features'].map((id) => !document.getElementById(id).hidden)");
     assert_eq!(shown, json!([false, true, false]));
+    assert_eq!(browser.value("document.getElementById('suite').hidden"), true, "there is no other engine");
     browser.click("#action :nth-child(4)");
     assert_eq!(browser.value(STATE)["action"], json!([3]));
     // The square has moved to column 3.
@@ -67,80 +62,6 @@ fn environments_of_ones_own_are_played() {
     assert_eq!(browser.complaints, Vec::<String>::new());
     // The page works offline.
     assert_eq!(browser.value("navigator.serviceWorker.ready.then(() => true)"), true);
-}
-
-#[test]
-#[ignore = "needs the built page and Chromium"]
-fn popgym_is_played_by_keys_and_by_touch_to_the_end() {
-    let (server, mut browser) = (PageServer::start("own/site"), start("popgym"));
-    for (family, keys) in [
-        ("Autoencode", ""),
-        ("Battleship", ""),
-        ("PositionOnlyCartPole", "ArrowLeft"),
-        ("Concentration", ""),
-        ("CountRecall", ""),
-        ("HigherLower", ""),
-        ("LabyrinthEscape", "ArrowRight"),
-        ("MineSweeper", ""),
-        ("MultiarmedBandit", ""),
-        ("PositionOnlyPendulum", "Space"),
-        ("RepeatFirst", ""),
-        ("RepeatPrevious", ""),
-    ] {
-        let id = format!("popgym-{family}Easy-v0");
-        for phone in [false, true] {
-            browser.resize(if phone { 390 } else { 1440 }, 844, phone);
-            visit(&mut browser, &server, &format!("env={id}&seed=7"));
-            let what = format!("{id}, phone: {phone}");
-            assert_eq!(browser.value(SHOWN), true, "{what}");
-            let first = picture(&mut browser);
-            act(&mut browser, keys, phone);
-            browser.wait(&format!("{STATE}.length > 0"));
-            browser.value("endless.play.stop()");
-            assert_eq!(browser.value(SHOWN), true, "{what}");
-            assert_eq!(browser.value("endless.play.player"), "person", "{what}");
-            browser.value("while (!endless.play.state.done) endless.play.oneStep()");
-            let said = text(&mut browser, "said");
-            assert!(said.contains(": return "), "{what}: {said}");
-            assert_eq!(browser.value("document.getElementById('share').checkVisibility()"), true, "{what}");
-            // The link opens the same episode.
-            let link = browser.value("location.hash.slice(1)");
-            visit(&mut browser, &server, link.as_str().unwrap());
-            assert_eq!((&browser.value(STATE)["id"], &browser.value(STATE)["seed"]), (&json!(id), &json!("7")));
-            assert!(picture(&mut browser) == first, "{what}: another episode");
-        }
-    }
-    browser.load("about:blank");
-    browser.load(&format!("{}#env=popgym-RepeatPreviousEasy-v0%3Fk%3D2&seed=7", server.url()));
-    browser.wait("globalThis.endless && !document.getElementById('message').hidden");
-    let said = text(&mut browser, "message");
-    assert_eq!(said, "the page plays environments without arguments, got `popgym-RepeatPreviousEasy-v0?k=2`");
-    assert_eq!(browser.complaints, Vec::<String>::new());
-}
-
-fn picture(browser: &mut Chromium) -> Json {
-    browser.value("Array.from(endless.engine.observation(endless.play.spec.picture).data)")
-}
-
-/// Plays by that key, or else by the last button of the actions, which the keyboard or a finger presses.
-fn act(browser: &mut Chromium, key: &str, phone: bool) {
-    let button = if key.is_empty() { "#action button:last-child" } else { "#pad button" };
-    if phone && key == "Space" {
-        browser.touch("touchStart", "#observation");
-        browser.touch("touchEnd", "#observation");
-    } else if phone {
-        browser.touch("touchStart", button);
-        browser.wait(&format!("{STATE}.length > 0 || document.querySelector('#pad button') === null"));
-        browser.touch("touchEnd", button);
-    } else if key.is_empty() {
-        browser.press("Tab");
-        browser.value(&format!("document.querySelector('{button}').focus()"));
-        browser.enter();
-        // It keeps the focus for the next step.
-        assert_eq!(browser.value(&format!("document.activeElement === document.querySelector('{button}')")), true);
-    } else {
-        browser.press(key);
-    }
 }
 
 #[test]

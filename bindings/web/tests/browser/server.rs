@@ -10,6 +10,7 @@ use std::time::Duration;
 
 pub struct PageServer {
     address: SocketAddr,
+    query: &'static str,
     stopped: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -37,12 +38,19 @@ impl PageServer {
                 std::thread::spawn(move || drop(answer(&folder, connection)));
             }
         });
-        PageServer { address, stopped, thread: Some(thread) }
+        PageServer { address, query: "", stopped, thread: Some(thread) }
+    }
+
+    /// Serves `web`, of which `url` is the page of POPGym.
+    pub fn popgym() -> Self {
+        let mut server = PageServer::start("web");
+        server.query = "?popgym";
+        server
     }
 
     /// The address of the page.
     pub fn url(&self) -> String {
-        format!("http://{}/", self.address)
+        format!("http://{}/{}", self.address, self.query)
     }
 }
 

@@ -1,5 +1,5 @@
-//! Environments of one's own for the tests: a small frame with unnamed actions, features only, and a box. The page has those of POPGym,
-//! too. The tests replace the library that `endless new` writes by this file.
+//! Environments of one's own for the tests: a small frame with unnamed actions, features only, and a box. The tests replace the
+//! library that `endless new` writes by this file.
 
 use endless_gym::envs::{ActionBranch, ActionSpace, Choice, Column, EnvSpec, ResetParameters, Task, Transition};
 use endless_gym::pool::{Registry, RegistryError};
@@ -11,15 +11,11 @@ use serde::{Deserialize, Serialize};
 pub const STEPS: u32 = 5;
 
 pub fn registry() -> Result<Registry, RegistryError> {
-    with_own(Registry::new())
-}
-
-fn with_own(registry: Registry) -> Result<Registry, RegistryError> {
-    registry.with::<Small>()?.with::<Numbers>()?.with::<Slider>()
+    Registry::new().with::<Small>()?.with::<Numbers>()?.with::<Slider>()
 }
 
 #[cfg(target_arch = "wasm32")]
-endless_gym_web::module!(with_own(endless_gym::popgym().clone()));
+endless_gym_web::module!(registry());
 
 const NUMBERS: &[ActionBranch] = &[
     ActionBranch { name: "move", choices: &[choice("stay"), choice("left"), choice("right")] },

@@ -41,7 +41,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
             architecture wasm32; a crate that `endless new` writes shows how"
             .into());
     }
-    let page = endless_gym_page::files(&bytes, |id| registry.spec(id).is_ok());
+    let page = endless_gym_page::files(&[("engine.wasm", &bytes)], |id| registry.spec(id).is_ok());
     for (name, bytes) in &page {
         let to = args.out.join(name);
         let written = fs::create_dir_all(&args.out).and_then(|()| files::replace(&to, bytes));
