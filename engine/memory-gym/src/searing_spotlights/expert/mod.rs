@@ -8,7 +8,7 @@ use super::parameters::Variant;
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Expert;
 use forecast::Forecast;
-use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, Plan, after, choose, dash};
+use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, after, dash, least_harmed, rows_within, unharmed};
 
 /// Distances in pixels between the centres of agent and coin or exit at which the agent reaches them, minus a safety margin.
 const COIN_REACH: i32 = 9;
@@ -128,42 +128,47 @@ impl SpotlightsExpert {
 
     /// The most cautious plan that reaches the goal; otherwise, if time is short, the plan with the fewest hits that reaches
     /// it; otherwise the most cautious plan without hits.
-    fn plan(&self, agent: Place, goal: Goal) -> Plan {
-        let mut waiting: Option<Plan> = None;
+    fn plan(&self, agent: Place, goal: Goal) -> [i32; 2] {
+        let path = |spotlight: &Forecast| (spotlight.radius, (0..=HORIZON).map(|step| spotlight.at(step)).collect());
+        let forecasts: Vec<Path> = self.spotlights.iter().map(path).collect();
+        let dangers = |caution, avoid_border| dangers(agent, &forecasts, caution, avoid_border);
+        let mut waiting = None;
         for (caution, avoid_border) in CAUTIONS {
-            let plan = choose(agent, goal, &self.dangers(caution, avoid_border));
-            if plan.hits == 0 {
+            if let Some(plan) = unharmed(agent, goal, &dangers(caution, avoid_border)) {
                 if plan.arrives {
-                    return plan;
+                    return plan.action;
                 }
-                waiting.get_or_insert(plan);
+                waiting.get_or_insert(plan.action);
                 if self.patience > CALM {
                     break;
                 }
             }
         }
         let hits = (URGENT.saturating_sub(self.patience) / STEPS_PER_HIT).min(self.health.saturating_sub(1)) as usize;
-        let dash = if hits > 0 { dash(agent, goal, &self.dangers(HURRY, false), hits) } else { None };
-        dash.or(waiting).unwrap_or_else(|| choose(agent, goal, &self.dangers(ESCAPE, false)))
+        let dash = if hits > 0 { dash(agent, goal, &dangers(HURRY, false), hits) } else { None };
+        dash.or(waiting).unwrap_or_else(|| least_harmed(agent, goal, &dangers(ESCAPE, false)))
     }
+}
 
-    /// The dangerous positions of each future step, with this share of the margin for the forecasts' uncertainty.
-    fn dangers(&self, caution: f64, avoid_border: bool) -> Vec<Danger> {
-        let mut dangers = vec![Danger::none(); HORIZON + 1];
-        for (step, danger) in dangers.iter_mut().enumerate().skip(1) {
-            for spotlight in &self.spotlights {
-                let (centre, deviation) = spotlight.at(step);
-                let margin = (caution * (1.0 + deviation)).min(MAX_MARGIN);
-                danger.add(centre, f64::from(spotlight.radius) + AGENT_RADIUS + 0.5 + margin);
-            }
-            // Near the border, a new spotlight leaves no time to escape. The first steps are exempt, so that the agent can
-            // leave the border.
-            if avoid_border && step > 4 {
-                danger.add_border();
-            }
+/// The radius of a spotlight, and its centre and standard deviation in each step.
+type Path = (i32, Vec<([f64; 2], f64)>);
+
+/// The dangerous positions of each future step that `agent` can reach, with this share of the margin for the forecasts' uncertainty.
+fn dangers(agent: Place, forecasts: &[Path], caution: f64, avoid_border: bool) -> Vec<Danger> {
+    let mut dangers = vec![Danger::none(); HORIZON + 1];
+    for (step, danger) in dangers.iter_mut().enumerate().skip(1) {
+        for (radius, path) in forecasts {
+            let (centre, deviation) = path[step];
+            let margin = (caution * (1.0 + deviation)).min(MAX_MARGIN);
+            danger.add(centre, f64::from(*radius) + AGENT_RADIUS + 0.5 + margin, rows_within(agent, step));
         }
-        dangers
+        // Near the border, a new spotlight leaves no time to escape. The first steps are exempt, so that the agent can
+        // leave the border.
+        if avoid_border && step > 4 {
+            danger.add_border();
+        }
     }
+    dangers
 }
 
 fn is_within(a: Place, b: Place, reach: i32) -> bool {
@@ -192,7 +197,7 @@ impl Expert for SpotlightsExpert {
         self.patience = if self.target == Some(goal.place) { self.patience.saturating_sub(1) } else { PATIENCE };
         self.target = Some(goal.place);
         let best = self.plan(agent, goal);
-        action.copy_from_slice(&best.action);
-        self.agent = Some(after(agent, best.action));
+        action.copy_from_slice(&best);
+        self.agent = Some(after(agent, best));
     }
 }

@@ -2,6 +2,8 @@
 //!
 //! Sets of places are bit sets, one for each row, so that one operation moves all places of a row.
 
+use std::ops::RangeInclusive;
+
 use crate::screen::SCREEN;
 
 /// A place in pixels: x, y.
@@ -44,6 +46,12 @@ fn moved(place: Place, pixels: Place) -> Place {
     std::array::from_fn(|axis| (place[axis] + pixels[axis]).clamp(LOW[axis], HIGH[axis]))
 }
 
+/// The rows that the agent can reach from a place in that many steps.
+pub(super) fn rows_within(start: Place, steps: usize) -> RangeInclusive<i32> {
+    let ([_, y], most) = (moved(start, [0, 0]), 3 * steps as i32);
+    (y - most).max(LOW[1])..=(y + most).min(HIGH[1])
+}
+
 /// A set of places, as a bit set for each row.
 #[derive(Clone, Debug, PartialEq)]
 struct Places([u128; SCREEN]);
@@ -80,56 +88,73 @@ impl Places {
         (LOW[0]..=HIGH[0]).contains(&x) && self.0.get(y as usize).is_some_and(|row| row & bits(x, x) != 0)
     }
 
-    fn is_empty(&self) -> bool {
-        self.0.iter().all(|row| *row == 0)
-    }
-
     /// The intersection of both sets.
     fn and(mut self, other: &Places) -> Self {
         self.0.iter_mut().zip(&other.0).for_each(|(row, other)| *row &= other);
         self
     }
 
-    /// The places from which an action leads into the set.
-    fn before(&self) -> Self {
+    /// The places in `rows` from which an action leads into the set.
+    fn before(&self, rows: RangeInclusive<i32>) -> Self {
         let mut before = Places::NONE;
+        let near = (rows.start() - 3).max(LOW[1])..=(rows.end() + 3).min(HIGH[1]);
         let [straight, level, diagonal] = self.rows(
+            near,
             |row| columns_before::<-3>(row) | columns_before::<3>(row),
             |row| columns_before::<-2>(row) | columns_before::<2>(row),
         );
-        for (dy, rows) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
-            for y in LOW[1]..=HIGH[1] {
-                before.0[y as usize] |= rows[(y + dy).clamp(LOW[1], HIGH[1]) as usize];
+        for (dy, moved) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
+            for y in rows.clone() {
+                before.0[y as usize] |= moved[(y + dy).clamp(LOW[1], HIGH[1]) as usize];
             }
         }
         before
     }
 
-    /// The places to which an action leads from the set.
-    fn after(&self) -> Self {
+    /// The places to which an action leads from the set, whose places are in `rows`.
+    fn after(&self, rows: RangeInclusive<i32>) -> Self {
         let mut after = Places::NONE;
         let [straight, level, diagonal] = self.rows(
+            rows.clone(),
             |row| columns_after::<-3>(row) | columns_after::<3>(row),
             |row| columns_after::<-2>(row) | columns_after::<2>(row),
         );
-        for (dy, rows) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
-            for y in LOW[1]..=HIGH[1] {
-                after.0[(y + dy).clamp(LOW[1], HIGH[1]) as usize] |= rows[y as usize];
+        for (dy, moved) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
+            for y in rows.clone() {
+                after.0[(y + dy).clamp(LOW[1], HIGH[1]) as usize] |= moved[y as usize];
             }
         }
         after
     }
 
-    /// The columns of each row after the [`MOVES`] that go straight up or down, stay in the row, or are diagonal.
-    fn rows(&self, aside: impl Fn(u128) -> u128, diagonal: impl Fn(u128) -> u128) -> [[u128; SCREEN]; 3] {
-        let straight = self.0.map(|row| row & WALKABLE);
-        [straight, straight.map(|row| row | aside(row)), straight.map(diagonal)]
+    /// The columns of `rows` after the [`MOVES`] that go straight up or down, stay in the row, or are diagonal.
+    fn rows(
+        &self,
+        rows: RangeInclusive<i32>,
+        aside: impl Fn(u128) -> u128,
+        diagonal: impl Fn(u128) -> u128,
+    ) -> [[u128; SCREEN]; 3] {
+        let mut moved = [[0; SCREEN]; 3];
+        for y in rows.map(|y| y as usize) {
+            let row = self.0[y] & WALKABLE;
+            [moved[0][y], moved[1][y], moved[2][y]] = [row, row | aside(row), diagonal(row)];
+        }
+        moved
+    }
+
+    /// The place that is nearest to a goal.
+    fn nearest(&self, goal: Goal) -> Option<Place> {
+        self.iter().min_by_key(|place| goal.distance(*place))
     }
 
     fn iter(&self) -> impl Iterator<Item = Place> + '_ {
         (LOW[1]..=HIGH[1]).flat_map(move |y| {
-            let row = self.0[y as usize];
-            (LOW[0]..=HIGH[0]).filter(move |x| row & bits(*x, *x) != 0).map(move |x| [x, y])
+            let mut row = self.0[y as usize] & WALKABLE;
+            std::iter::from_fn(move || {
+                let x = (row != 0).then(|| row.trailing_zeros() as i32)?;
+                row &= row - 1;
+                Some([x, y])
+            })
         })
     }
 }
@@ -163,14 +188,14 @@ impl Danger {
         Danger(Places::NONE)
     }
 
-    /// Adds all places within `reach` pixels of `centre`.
-    pub fn add(&mut self, centre: [f64; 2], reach: f64) {
-        let [first, end] = [centre[1] - reach, centre[1] + reach + 2.0].map(|y| (y.max(0.0) as usize).min(SCREEN));
-        for (y, row) in self.0.0.iter_mut().enumerate().take(end).skip(first) {
-            let rest = reach * reach - (y as f64 - centre[1]).powi(2);
+    /// Adds all places in `rows` within `reach` pixels of `centre`.
+    pub fn add(&mut self, centre: [f64; 2], reach: f64, rows: RangeInclusive<i32>) {
+        let [first, last] = [centre[1] - reach, centre[1] + reach + 1.0].map(|y| y as i32);
+        for y in first.max(*rows.start())..=last.min(*rows.end()) {
+            let rest = reach * reach - (f64::from(y) - centre[1]).powi(2);
             if rest >= 0.0 {
                 let half = rest.sqrt();
-                *row |= bits((centre[0] - half).ceil() as i32, (centre[0] + half).floor() as i32);
+                self.0.0[y as usize] |= bits((centre[0] - half).ceil() as i32, (centre[0] + half).floor() as i32);
             }
         }
     }
@@ -202,53 +227,57 @@ impl Goal {
 
     fn places(&self) -> Places {
         let mut danger = Danger::none();
-        danger.add(self.place.map(f64::from), f64::from(self.reach));
+        danger.add(self.place.map(f64::from), f64::from(self.reach), LOW[1]..=HIGH[1]);
         danger.0
     }
 }
 
-/// The next action, and the outcome of the rest of the plan.
+/// The next action of a path without a dangerous step.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Plan {
     pub action: [i32; 2],
-    /// Number of dangerous steps.
-    pub hits: usize,
     /// Whether the plan reaches the goal before the horizon.
     pub arrives: bool,
 }
 
-/// The first action of the path with the fewest dangerous steps up to the horizon and, among those, the earliest arrival at the
-/// goal or the smallest distance to it. `dangers` has an entry for the current step, which is ignored, and one for each future
-/// step.
-pub(super) fn choose(start: Place, goal: Goal, dangers: &[Danger]) -> Plan {
+/// The first action of the path without a dangerous step up to the horizon that arrives at the goal first, or else ends nearest to
+/// it; `None` if each path has one. `dangers` has an entry for the current step, which is ignored, and one for each future step.
+pub(super) fn unharmed(start: Place, goal: Goal, dangers: &[Danger]) -> Option<Plan> {
     let start = moved(start, [0, 0]);
-    let next = MOVES.map(|(action, pixels)| (action, moved(start, pixels)));
-    let safe = survivable(dangers, None);
-    if next.iter().any(|(_, place)| safe[1].contains(*place)) {
-        let (action, arrives) = safe_action(start, goal, &safe);
-        return Plan { action, hits: 0, arrives };
-    }
-    // With as many hits as steps, every path is possible.
-    let mut allowed = safe;
-    for hits in 1..dangers.len() {
-        allowed = survivable(dangers, Some(&allowed));
-        let firsts = next.iter().filter(|(_, place)| allowed[1].contains(*place));
-        if let Some((action, _)) = firsts.min_by_key(|(_, place)| goal.distance(*place)) {
-            return Plan { action: *action, hits, arrives: false };
-        }
-    }
-    Plan { action: [0, 0], hits: dangers.len(), arrives: false }
+    let safe = survivable(start, dangers, None);
+    MOVES.iter().find(|(_, pixels)| safe[1].contains(moved(start, *pixels)))?;
+    let (reached, arrival) = walk(start, goal, &safe, None);
+    let last = reached.len() - 1;
+    let end = arrival.or_else(|| reached[last].nearest(goal).map(|place| (last, place)));
+    let action = end.and_then(|(step, place)| first_action(step, place, 0, &[reached], &safe)).unwrap_or([0, 0]);
+    Some(Plan { action, arrives: arrival.is_some() })
 }
 
-/// For each step, the places from which the rest of the path needs no dangerous step, or one more than from the places of
-/// `easier`.
-fn survivable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
-    let everywhere = Places([u128::MAX; SCREEN]);
-    let mut sets = vec![everywhere.clone(); dangers.len() + 1];
+/// The first action of the path with the fewest dangerous steps up to the horizon, at least one, and the nearest to the goal among
+/// those actions.
+pub(super) fn least_harmed(start: Place, goal: Goal, dangers: &[Danger]) -> [i32; 2] {
+    let start = moved(start, [0, 0]);
+    let next = MOVES.map(|(action, pixels)| (action, moved(start, pixels)));
+    // With as many hits as steps, every path is possible.
+    let mut allowed = survivable(start, dangers, None);
+    for _ in 1..dangers.len() {
+        allowed = survivable(start, dangers, Some(&allowed));
+        let firsts = next.iter().filter(|(_, place)| allowed[1].contains(*place));
+        if let Some((action, _)) = firsts.min_by_key(|(_, place)| goal.distance(*place)) {
+            return *action;
+        }
+    }
+    [0, 0]
+}
+
+/// For each step, the places within reach of `start` from which the rest of the path needs no dangerous step, or one more than from
+/// the places of `easier`.
+fn survivable(start: Place, dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
+    let mut sets = vec![Places::NONE; dangers.len()];
     for step in (1..dangers.len()).rev() {
         let before = |sets: &[Places]| {
-            let is_last = step + 1 == dangers.len();
-            if is_last { everywhere.clone() } else { sets[step + 1].before() }
+            let next = sets.get(step + 1);
+            next.map_or(Places([u128::MAX; SCREEN]), |next| next.before(rows_within(start, step)))
         };
         let mut set = before(&sets).and(&dangers[step].safe());
         if let Some(easier) = easier {
@@ -262,57 +291,40 @@ fn survivable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
 
 /// The first action of the path to the goal with the fewest dangerous steps, if one exists with at most `max_hits` of them.
 /// Ignores what happens after the arrival.
-pub(super) fn dash(start: Place, goal: Goal, dangers: &[Danger], max_hits: usize) -> Option<Plan> {
+pub(super) fn dash(start: Place, goal: Goal, dangers: &[Danger], max_hits: usize) -> Option<[i32; 2]> {
+    let start = moved(start, [0, 0]);
     let safe: Vec<Places> = dangers.iter().map(Danger::safe).collect();
-    let (action, hits) = shortest_path(moved(start, [0, 0]), goal, &safe, max_hits)?;
-    Some(Plan { action, hits, arrives: true })
-}
-
-/// The first action of the path to the goal through `safe` places, one set for each step, and whether it arrives.
-fn safe_action(start: Place, goal: Goal, safe: &[Places]) -> ([i32; 2], bool) {
-    shortest_path(start, goal, safe, 0)
-        .map_or_else(|| (approach(start, goal, safe), false), |(action, _)| (action, true))
-}
-
-/// The first action and the number of dangerous steps of the shortest path to the goal among those with the fewest dangerous
-/// steps.
-fn shortest_path(start: Place, goal: Goal, safe: &[Places], max_hits: usize) -> Option<([i32; 2], usize)> {
-    let goals = goal.places();
-    // For each number of dangerous steps, the places after each step.
-    let mut easier: Vec<Places> = Vec::new();
+    // For each number of dangerous steps.
     let mut reached: Vec<Vec<Places>> = Vec::new();
     for hits in 0..=max_hits {
-        let mut places = vec![if hits == 0 { Places::only(start) } else { Places::NONE }];
-        for (step, safe) in safe.iter().enumerate().take(HORIZON + 1).skip(1) {
-            let mut next = places[step - 1].after().and(safe);
-            if let Some(easier) = easier.get(step - 1) {
-                let hurt = easier.after().0;
-                next.0.iter_mut().zip(hurt.iter().zip(&safe.0)).for_each(|(next, (hurt, safe))| *next |= hurt & !safe);
-            }
-            places.push(next);
-        }
-        let arrival = places.iter().map(|places| places.clone().and(&goals)).enumerate().skip(1);
-        let arrival = arrival.filter(|(_, places)| !places.is_empty()).find_map(|(step, places)| {
-            places.iter().min_by_key(|place| goal.distance(*place)).map(|place| (step, place))
-        });
-        easier = places.clone();
+        let (places, arrival) = walk(start, goal, &safe, reached.last().map(Vec::as_slice));
         reached.push(places);
         if let Some((step, place)) = arrival {
-            return first_action(step, place, hits, &reached, safe).map(|action| (action, hits));
+            return first_action(step, place, hits, &reached, &safe);
         }
     }
     None
 }
 
-/// The first action of the path that ends nearest to the goal.
-fn approach(start: Place, goal: Goal, safe: &[Places]) -> [i32; 2] {
-    let mut reached = vec![Places::only(start)];
+/// The places after each step on paths through `safe` places, or on those with one more dangerous step than the paths of `easier`,
+/// until one arrives: after which step, and where.
+fn walk(start: Place, goal: Goal, safe: &[Places], easier: Option<&[Places]>) -> (Vec<Places>, Option<(usize, Place)>) {
+    let goals = goal.places();
+    let mut places = vec![if easier.is_none() { Places::only(start) } else { Places::NONE }];
     for (step, safe) in safe.iter().enumerate().take(HORIZON + 1).skip(1) {
-        reached.push(reached[step - 1].after().and(safe));
+        let rows = rows_within(start, step - 1);
+        let mut next = places[step - 1].after(rows.clone()).and(safe);
+        if let Some(easier) = easier {
+            let hurt = easier[step - 1].after(rows).0;
+            next.0.iter_mut().zip(hurt.iter().zip(&safe.0)).for_each(|(next, (hurt, safe))| *next |= hurt & !safe);
+        }
+        let arrival = next.clone().and(&goals).nearest(goal);
+        places.push(next);
+        if let Some(place) = arrival {
+            return (places, Some((step, place)));
+        }
     }
-    let last = reached.len() - 1;
-    let nearest = reached[last].iter().min_by_key(|place| goal.distance(*place));
-    nearest.and_then(|place| first_action(last, place, 0, &[reached], safe)).unwrap_or([0, 0])
+    (places, None)
 }
 
 /// Traces a path back from its place after `step` steps with `hits` hits, and returns its first action.
@@ -347,12 +359,12 @@ mod tests {
     fn moves_of_sets_are_the_moves_of_their_places() {
         let corners = [[6, 10], [7, 11], [78, 78], [77, 40], [40, 79], [42, 42]];
         for start in corners.map(|place| moved(place, [0, 0])) {
-            let after = Places::only(start).after();
+            let after = Places::only(start).after(LOW[1]..=HIGH[1]);
             let expected = MOVES.map(|(_, pixels)| moved(start, pixels));
             assert!(after.iter().all(|place| expected.contains(&place)), "{start:?}");
             for place in expected {
                 assert!(after.contains(place), "{start:?} to {place:?}");
-                assert!(Places::only(place).before().contains(start), "{start:?} to {place:?}");
+                assert!(Places::only(place).before(rows_within(start, 0)).contains(start), "{start:?} to {place:?}");
             }
         }
     }
@@ -363,7 +375,7 @@ mod tests {
         let goal = Goal { place: [70, 40], reach: 3 };
         let mut place = [20, 40];
         for _ in 0..16 {
-            place = after(place, choose(place, goal, &dangers).action);
+            place = after(place, unharmed(place, goal, &dangers).unwrap().action);
         }
         assert!(goal.distance(place) <= 9, "{place:?}");
     }
@@ -373,15 +385,15 @@ mod tests {
         let wall = |step: usize| {
             let mut danger = Danger::none();
             if step < 12 {
-                (0..84).step_by(4).for_each(|y| danger.add([40.0, f64::from(y)], 6.0));
+                (0..84).step_by(4).for_each(|y| danger.add([40.0, f64::from(y)], 6.0, LOW[1]..=HIGH[1]));
             }
             danger
         };
         let dangers: Vec<_> = (0..=HORIZON).map(wall).collect();
         let goal = Goal { place: [60, 40], reach: 3 };
-        let plan = choose([30, 40], goal, &dangers);
-        assert_eq!(plan.hits, 0);
+        assert!(unharmed([30, 40], goal, &dangers).is_some());
         let surrounded = vec![Danger(Places([u128::MAX; SCREEN])); HORIZON + 1];
-        assert_eq!(choose([30, 40], goal, &surrounded).hits, HORIZON);
+        assert!(unharmed([30, 40], goal, &surrounded).is_none());
+        assert_eq!(least_harmed([30, 40], goal, &surrounded), [2, 0]);
     }
 }
