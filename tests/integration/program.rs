@@ -7,9 +7,10 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::support::place::Place;
-use crate::support::process::{Process, pseudo_terminal, text};
+use crate::support::process::{Process, pseudo_terminal, text, wait_until};
 use crate::support::recorded::traces;
 use crate::support::service::reset;
+use endless_gym::service::{EngineStatus, running_engines};
 use rustix::process::Signal;
 use serde_json::Value as Json;
 
@@ -161,6 +162,10 @@ fn ctrl_c_ends_the_demo_with_its_summary() {
     let mut demo = place.endless(&["demo", "--num-envs", "8", "--seconds", "60"]);
     let mut demo = Process::spawn(demo.stdout(Stdio::piped()));
     place.wait_for_engine();
+    let engine = &running_engines(place.namespace()).unwrap()[0];
+    // Before the first step, there is nothing to sum up.
+    let status = || EngineStatus::of(place.namespace(), engine);
+    wait_until("the demo plays", || status().is_some_and(|status| status.groups[0].step > 0));
     demo.interrupt();
     assert!(demo.output().contains("steps per second"));
     place.assert_nothing_left();
