@@ -122,6 +122,18 @@ def test_the_page_has_scores_gates_and_longer_versions() -> None:
     assert "| `none` | 2 | 0.00 [0.00, 0.00] | 1.00 [1.00, 1.00] | 0.00 | 0.00 |" in made
     assert "| repeat-first | object | 1 | -0.500 | passed |" in made
     assert "| `gru` | 0.10 → 0.05 | 1.00 → 0.50 |" in made
+    assert "Which memory" not in made
+    # Five runs show that the GRU is better with commands, but not that another is with cards; the cheapest of two is named.
+    scores = {"none": ((0.0, 0.0), (0.0, 0.0)), "gru": ((0.1, 0.1), (0.5, 0.1)), "lru": ((0.05, 0.05), (0.1, 0.4))}
+    fives = [
+        mean_row(agent, task, seed, both[seed % 2]) | {"core_seconds": 20 if agent == "lru" else 60}
+        for agent, of_tasks in scores.items()
+        for task, both in zip(track.tasks, of_tasks, strict=True)
+        for seed in range(5)
+    ]
+    told = page(fives)
+    assert "| one-command | object | `gru` 1.00 |  | `gru` 60 |" in told
+    assert "| repeat-first | object | `gru` 0.34 | `lru` | `lru` 20 |" in told
     # An agent with holes has no mean, and a task without zero is left out.
     assert "| `gru` | 1-2 | incomplete |  | 1.00 | 1.00 |" in page(rows[:-1])
     assert (

@@ -433,6 +433,7 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
         "",
         "![comparison](comparison.svg)",
         "",
+        *answers(track, comparison),
         *compare.markdown(comparison, "## Agents"),
         *longer_table(track, rows),
     ]
@@ -459,6 +460,31 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
             "",
         ]
     return "\n".join([*lines, *tables.markdown(columns, gates)]) + "\n"
+
+
+def answers(track: Track, comparison: Comparison) -> list[str]:
+    """Which memories suit which task; no lines for fewer than two memories."""
+    others = {entry.name for entry in track.agents.values() if entry.observable or entry.agent in MEMORYLESS}
+    agents = [agent for agent in comparison.scores if agent not in others]
+    if len(agents) < 2:
+        return []
+    rows = []
+    for task in comparison.tasks:
+        best, *rest = found = comparison.contenders(task, agents)
+        cost = {agent: comparison.costs(agent).get("core_seconds", 0.0) for agent in found}
+        cheapest = min(found, key=cost.__getitem__)
+        named = f"`{best}` {comparison.mean(best, task):.2f}", ", ".join(f"`{agent}`" for agent in rest)
+        rows.append([task, track.tasks[task].label, *named, f"`{cheapest}` {cost[cheapest]:.0f}"])
+    columns = {"task": False, "measures": False, "highest normalised mean": False, "not shown to be worse": False}
+    return [
+        "## Which memory for which task",
+        "",
+        "An agent is not shown to be worse if the 95 % interval of the probability that a run of the best scores higher includes",
+        "one half. Not known: other budgets, sizes and tasks, frames in place of features, and other configurations.",
+        "",
+        *tables.markdown(columns | {"cheapest of these, core-seconds": False}, rows),
+        "",
+    ]
 
 
 def gap(comparison: Comparison, task: str, twin: str, agent: str) -> str:
