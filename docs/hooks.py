@@ -19,7 +19,7 @@ PAGES = {
     "design/comparison.md": "benches/comparison.md",
     "reference/changes.md": "CHANGELOG.md",
     "train/learning.md": "agents/benches/learning/README.md",
-    "train/leaderboard.md": "agents/benches/leaderboard/laptop/README.md",
+    "train/leaderboard.md": "agents/benches/leaderboard/million/README.md",
     "train/hour.md": "agents/benches/hour/README.md",
 }
 

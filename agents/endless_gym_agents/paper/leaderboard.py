@@ -5,10 +5,10 @@ table" of the documentation describes it. Each run is one `endless-train` and on
 what was interrupted and skips what is done. A track of the package comes with rows, to which the runs of other agents are added.
 
 ```console
-endless-leaderboard laptop                                     # everything, as many runs at a time as there are cores
-endless-leaderboard laptop --agents own.py:Mine                # a memory of your own among those of the table
+endless-leaderboard million                                     # everything, as many runs at a time as there are cores
+endless-leaderboard million --agents own.py:Mine                # a memory of your own among those of the table
 endless-leaderboard mine.json                                  # a track of your own
-endless-leaderboard laptop --table                             # only the table, from the runs so far
+endless-leaderboard million --table                             # only the table, from the runs so far
 ```
 """
 
