@@ -213,10 +213,9 @@ class Comparison:
         return self.normalised(task, statistics.mean(scores.values())) if scores else None
 
     def contenders(self, task: str, agents: Sequence[str]) -> list[str]:
-        """Those of some agents that the one with the highest mean in a task is not shown to be better than; it is the first."""
-        means = {agent: mean for agent in agents if (mean := self.mean(agent, task)) is not None}
-        best, *others = sorted(means, key=means.__getitem__, reverse=True)
-        scores = {agent: np.array([*self.scores[agent][task].values()])[:, np.newaxis] for agent in means}
+        """Those of some agents with runs in a task that the best by its mean, the first, is not shown to be better than."""
+        scores = {agent: np.array([*self.scores[agent][task].values()])[:, np.newaxis] for agent in agents}
+        best, *others = sorted(scores, key=lambda agent: -scores[agent].mean())
         return [best, *(other for other in others if not _pair(best, other, scores[best], scores[other]).is_claim)]
 
     def agents(self) -> list[str]:

@@ -5,10 +5,10 @@ table" of the documentation describes it. Each run is one `endless-train` and on
 what was interrupted and skips what is done. A track of the package comes with rows, to which the runs of other agents are added.
 
 ```console
-endless-leaderboard million                                     # everything, as many runs at a time as there are cores
-endless-leaderboard million --agents own.py:Mine                # a memory of your own among those of the table
+endless-leaderboard million                                    # everything, as many runs at a time as there are cores
+endless-leaderboard million --agents own.py:Mine               # a memory of your own among those of the table
 endless-leaderboard mine.json                                  # a track of your own
-endless-leaderboard million --table                             # only the table, from the runs so far
+endless-leaderboard million --table                            # only the table, from the runs so far
 ```
 """
 
@@ -465,17 +465,19 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
 def answers(track: Track, comparison: Comparison) -> list[str]:
     """Which memories suit which task; no lines for fewer than two memories."""
     others = {entry.name for entry in track.agents.values() if entry.observable or entry.agent in MEMORYLESS}
-    agents = [agent for agent in comparison.scores if agent not in others]
-    if len(agents) < 2:
-        return []
     rows = []
     for task in comparison.tasks:
+        agents = [agent for agent, runs in comparison.scores.items() if agent not in others and task in runs]
+        if len(agents) < 2:
+            continue
         best, *rest = found = comparison.contenders(task, agents)
         cost = {agent: comparison.costs(agent).get("core_seconds", 0.0) for agent in found}
         cheapest = min(found, key=cost.__getitem__)
         named = f"`{best}` {comparison.mean(best, task):.2f}", ", ".join(f"`{agent}`" for agent in rest)
         rows.append([task, track.tasks[task].label, *named, f"`{cheapest}` {cost[cheapest]:.0f}"])
     columns = {"task": False, "measures": False, "highest normalised mean": False, "not shown to be worse": False}
+    if not rows:
+        return []
     return [
         "## Which memory for which task",
         "",
