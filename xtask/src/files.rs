@@ -54,15 +54,14 @@ fn subjects() -> Result<(), String> {
     let Ok(subjects) = output(Command::new("git").current_dir(workspace()).args(log)) else { return Ok(()) };
     let is_right = |subject: &str| subject.contains(": ") && subject.chars().count() <= 72;
     let wrong = subjects.lines().find(|subject| !is_right(subject));
-    let rule = "a commit's subject must be `scope: imperative`, at most 72 characters";
-    wrong.map_or(Ok(()), |subject| Err(format!("{rule}, got `{subject}`")))
+    let error = |subject| format!("a subject must be `scope: imperative`, at most 72 characters; got `{subject}`");
+    wrong.map_or(Ok(()), |subject| Err(error(subject)))
 }
 
 /// Checks that the version, the oldest Rust and maturin are the same wherever they are repeated.
 fn versions() -> Result<(), String> {
     let version = env!("CARGO_PKG_VERSION");
     let rust = format!("Rust {}", env!("CARGO_PKG_RUST_VERSION"));
-    let maturin = release::TOOLS[0].to_owned();
     let expected = [
         ("CITATION.cff", format!("\nversion: {version}\n")),
         ("agents/pyproject.toml", format!("\nversion = \"{version}\"\n")),
@@ -71,7 +70,7 @@ fn versions() -> Result<(), String> {
         ("README.md", rust.clone()),
         ("CONTRIBUTING.md", rust.clone()),
         ("bindings/python/README.md", rust),
-        ("Dockerfile", maturin),
+        ("Dockerfile", release::TOOLS[0].to_owned()),
         ("bindings/python/uv.lock", "\nname = \"maturin\"\nversion = \"1.16.0\"\n".to_owned()),
     ];
     for (file, text) in expected {

@@ -77,10 +77,8 @@ fn page(folder: &Path) -> Result<(), String> {
     let name = versioned("endless-gym-web");
     let options = "--create --gzip --sort=name --mtime=@0 --owner=0 --group=0 --numeric-owner --mode=u=rwX,go=rX";
     let mut tar = Command::new("tar");
-    tar.args(options.split(' '))
-        .arg(format!("--transform=s,^\\.,{name},"))
-        .arg("--file")
-        .arg(folder.join(format!("{name}.tar.gz")));
+    tar.args(options.split(' ')).arg(format!("--transform=s,^\\.,{name},"));
+    tar.arg("--file").arg(folder.join(format!("{name}.tar.gz")));
     run(tar.arg("--directory").arg(web::folder()?).arg("."))
 }
 
@@ -163,11 +161,9 @@ fn versioned(name: &str) -> String {
 
 /// Maturin with a path on which it finds zig's Python first.
 fn maturin(tools: &Path, task: &str) -> Command {
-    let mut path = tools.join("bin").into_os_string();
-    path.push(":");
-    path.push(std::env::var_os("PATH").unwrap_or_default());
+    let before = std::env::var("PATH").unwrap_or_default();
     let mut command = Command::new(tools.join("bin/maturin"));
-    command.arg(task).env("PATH", path);
+    command.arg(task).env("PATH", format!("{}:{before}", tools.join("bin").display()));
     command
 }
 

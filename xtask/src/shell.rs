@@ -1,6 +1,5 @@
 //! Paths of the project and this machine, and commands.
 
-use std::ffi::OsString;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -27,15 +26,10 @@ pub fn folders(source: &Path) -> Result<[(PathBuf, &'static str); 4], String> {
 }
 
 /// Compiler flags that replace paths of this machine in panic messages.
-pub fn remap(source: &Path) -> Result<OsString, String> {
+pub fn remap(source: &Path) -> Result<String, String> {
     // If several match, the compiler applies the last.
-    let flags = folders(source)?.map(|(from, to)| {
-        let mut flag = OsString::from("--remap-path-prefix=");
-        flag.push(from);
-        flag.push(format!("={to}"));
-        flag
-    });
-    Ok(flags.join("\x1f".as_ref()))
+    let flags = folders(source)?.map(|(from, to)| format!("--remap-path-prefix={}={to}", from.display()));
+    Ok(flags.join("\x1f"))
 }
 
 /// The cargo that runs this program, for the same toolchain and settings, in the root of the workspace.

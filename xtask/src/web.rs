@@ -91,9 +91,8 @@ pub fn build() -> Result<(), String> {
     let app = files.iter().find(|(name, _)| *name == "app.js").map(|(_, bytes)| String::from_utf8_lossy(bytes));
     let is_named = |id: &str| app.as_ref().is_some_and(|app| app.contains(&format!("\"{id}\"")));
     let is_landing = |agent: &str| is_named(agent.trim_end_matches("-none"));
-    let first = files
-        .iter()
-        .filter(|(name, _)| *name != ENGINES[1] && name.strip_suffix(".safetensors").is_none_or(is_landing));
+    let is_first = |name: &str| name != ENGINES[1] && name.strip_suffix(".safetensors").is_none_or(is_landing);
+    let first = files.iter().filter(|(name, _)| is_first(name));
     let compressed: u64 = first.flat_map(|(_, bytes)| compress(bytes)).sum();
     let index = folder()?.join("index.html");
     println!("    {} files, at first {compressed} bytes compressed, {}", files.len(), index.display());
@@ -105,8 +104,7 @@ pub fn build() -> Result<(), String> {
 
 /// Builds the engine with the environments of a suite.
 fn engine(suite: &str) -> Result<Vec<u8>, String> {
-    // The manifest does not ask for a `cdylib`: cargo would then build one for every crate that depends on the library, under the same
-    // name.
+    // With a `cdylib` in the manifest, cargo would build one for every crate that depends on the library, under the same name.
     let package = ["rustc", "--locked", "--release", "--package", "endless-gym-web", "--lib", "--crate-type", "cdylib"];
     let mut cargo = cargo(&package);
     cargo.args(["--no-default-features", "--features", suite, "--target", TARGET]);
