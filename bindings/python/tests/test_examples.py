@@ -249,23 +249,24 @@ def test_asynchronous_actors_end_together(tmp_path, ended):
         else:
             os.killpg(process.pid, signal.SIGINT)
         _, message = process.communicate(timeout=60)
+        if ended != "learner":
+            assert process.returncode == 1
+            assert "Traceback" not in message
+            cause = rf"by Ctrl-C after \d+ steps|after \d+ steps: actor 1 \(process {actors[1]}\) has ended.*"
+            assert re.fullmatch(rf"stopped ({cause})", message.strip().splitlines()[-1]), message
+        tensors = tuple(f"torch_{pid}_" for pid in (learner, *actors))
+        deadline = time.monotonic() + 60
+        while (
+            left := segments()
+            | {name for name in os.listdir("/dev/shm") if name.startswith(tensors)}
+            | {pid for pid in actors if is_running(pid)}
+        ):
+            assert time.monotonic() < deadline, left
+            time.sleep(0.05)
     finally:
+        # Not before: an engine that is killed while it ends leaves its segments.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-    if ended != "learner":
-        assert process.returncode == 1
-        assert "Traceback" not in message
-        cause = rf"by Ctrl-C after \d+ steps|after \d+ steps: actor 1 \(process {actors[1]}\) has ended.*"
-        assert re.fullmatch(rf"stopped ({cause})", message.strip().splitlines()[-1]), message
-    tensors = tuple(f"torch_{pid}_" for pid in (learner, *actors))
-    deadline = time.monotonic() + 60
-    while (
-        left := segments()
-        | {name for name in os.listdir("/dev/shm") if name.startswith(tensors)}
-        | {pid for pid in actors if is_running(pid)}
-    ):
-        assert time.monotonic() < deadline, left
-        time.sleep(0.05)
 
 
 def is_running(pid):
