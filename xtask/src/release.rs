@@ -161,9 +161,11 @@ fn versioned(name: &str) -> String {
 
 /// Maturin with a path on which it finds zig's Python first.
 fn maturin(tools: &Path, task: &str) -> Command {
-    let before = std::env::var("PATH").unwrap_or_default();
+    let mut path = tools.join("bin").into_os_string();
+    path.push(":");
+    path.push(std::env::var_os("PATH").unwrap_or_default());
     let mut command = Command::new(tools.join("bin/maturin"));
-    command.arg(task).env("PATH", format!("{}:{before}", tools.join("bin").display()));
+    command.arg(task).env("PATH", path);
     command
 }
 

@@ -246,7 +246,9 @@ def _entry(given: Any, where: str = "--agents") -> Entry:
 
 
 def trials(track: Track, entry: Entry, own: Mapping[str, Sequence[Any]] | None = None) -> list[Flags]:
-    """The flags of an agent's trials: the first choices, and then random ones, of what is common the same for all agents.
+    """The flags of an agent's trials: the first choices, and then random ones.
+
+    What is common is drawn alike for all agents, but a configuration that an agent already has is drawn anew.
 
     Args:
         track: The track.
@@ -463,7 +465,7 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
 
 
 def answers(track: Track, comparison: Comparison) -> list[str]:
-    """Which memories suit which task; no lines for fewer than two memories."""
+    """Which memories suit which task, of the tasks with two memories or more; no lines without such a task."""
     others = {entry.name for entry in track.agents.values() if entry.observable or entry.agent in MEMORYLESS}
     rows = []
     for task in comparison.tasks:
