@@ -8,7 +8,7 @@ use super::parameters::Variant;
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Expert;
 use forecast::Forecast;
-use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, after, dash, least_harmed, rows_within, unharmed};
+use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, after, dash, least_harmed, unharmed, within};
 
 /// Distances in pixels between the centres of agent and coin or exit at which the agent reaches them, minus a safety margin.
 const COIN_REACH: i32 = 9;
@@ -160,7 +160,7 @@ fn dangers(agent: Place, forecasts: &[Path], caution: f64, avoid_border: bool) -
         for (radius, path) in forecasts {
             let (centre, deviation) = path[step];
             let margin = (caution * (1.0 + deviation)).min(MAX_MARGIN);
-            danger.add(centre, f64::from(*radius) + AGENT_RADIUS + 0.5 + margin, rows_within(agent, step));
+            danger.add(centre, f64::from(*radius) + AGENT_RADIUS + 0.5 + margin, within(agent, step));
         }
         // Near the border, a new spotlight leaves no time to escape. The first steps are exempt, so that the agent can
         // leave the border.

@@ -46,15 +46,23 @@ fn moved(place: Place, pixels: Place) -> Place {
     std::array::from_fn(|axis| (place[axis] + pixels[axis]).clamp(LOW[axis], HIGH[axis]))
 }
 
-/// The rows that the agent can reach from a place in that many steps.
-pub(super) fn rows_within(start: Place, steps: usize) -> RangeInclusive<i32> {
-    let ([_, y], most) = (moved(start, [0, 0]), 3 * steps as i32);
-    (y - most).max(LOW[1])..=(y + most).min(HIGH[1])
+/// The columns and rows that the agent can reach from a place in that many steps.
+pub(super) fn within(start: Place, steps: usize) -> [RangeInclusive<i32>; 2] {
+    let (start, most) = (moved(start, [0, 0]), 3 * steps as i32);
+    std::array::from_fn(|axis| (start[axis] - most).max(LOW[axis])..=(start[axis] + most).min(HIGH[axis]))
 }
 
-/// A set of places, as a bit set for each row.
+fn rows_within(start: Place, steps: usize) -> RangeInclusive<i32> {
+    let [_, rows] = within(start, steps);
+    rows
+}
+
+/// A bit set of columns for each row.
+type Rows = [u128; SCREEN];
+
+/// A set of places.
 #[derive(Clone, Debug, PartialEq)]
-struct Places([u128; SCREEN]);
+struct Places(Rows);
 
 /// The bits below each number, since WebAssembly is slow at shifts of 128 bits by numbers that vary.
 const BELOW: [u128; 128] = {
@@ -94,37 +102,63 @@ impl Places {
         self
     }
 
+    /// The places that are not in the other set.
+    fn without(mut self, other: &Places) -> Self {
+        self.0.iter_mut().zip(&other.0).for_each(|(row, other)| *row &= !other);
+        self
+    }
+
+    fn is_empty(&self) -> bool {
+        self.0.iter().all(|row| *row == 0)
+    }
+
+    fn extend(&mut self, other: &Places) {
+        self.0.iter_mut().zip(&other.0).for_each(|(row, other)| *row |= other);
+    }
+
     /// The places in `rows` from which an action leads into the set.
     fn before(&self, rows: RangeInclusive<i32>) -> Self {
-        let mut before = Places::NONE;
+        let [low, high] = [LOW[1], HIGH[1]].map(|y| y as usize);
         let near = (rows.start() - 3).max(LOW[1])..=(rows.end() + 3).min(HIGH[1]);
-        let [straight, level, diagonal] = self.rows(
+        let [mut straight, level, mut diagonal] = self.rows(
             near,
             |row| columns_before::<-3>(row) | columns_before::<3>(row),
             |row| columns_before::<-2>(row) | columns_before::<2>(row),
         );
-        for (dy, moved) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
-            for y in rows.clone() {
-                before.0[y as usize] |= moved[(y + dy).clamp(LOW[1], HIGH[1]) as usize];
-            }
+        // Moves beyond the limits end at them.
+        for (moved, most) in [(&mut straight, 3), (&mut diagonal, 2)] {
+            let [first, last] = [moved[low], moved[high]];
+            moved[low - most..low].fill(first);
+            moved[high + 1..=high + most].fill(last);
         }
-        before
+        Places::gathered(rows, &straight, &level, &diagonal)
     }
 
     /// The places to which an action leads from the set, whose places are in `rows`.
     fn after(&self, rows: RangeInclusive<i32>) -> Self {
-        let mut after = Places::NONE;
+        let [low, high] = [LOW[1], HIGH[1]].map(|y| y as usize);
+        let near = (rows.start() - 3).max(LOW[1])..=(rows.end() + 3).min(HIGH[1]);
         let [straight, level, diagonal] = self.rows(
-            rows.clone(),
+            rows,
             |row| columns_after::<-3>(row) | columns_after::<3>(row),
             |row| columns_after::<-2>(row) | columns_after::<2>(row),
         );
-        for (dy, moved) in [(0, &level), (-3, &straight), (3, &straight), (-2, &diagonal), (2, &diagonal)] {
-            for y in rows.clone() {
-                after.0[(y + dy).clamp(LOW[1], HIGH[1]) as usize] |= moved[y as usize];
-            }
+        let mut after = Places::gathered(near, &straight, &level, &diagonal);
+        // Moves beyond the limits end at them.
+        for (moved, most) in [(&straight, 3), (&diagonal, 2)] {
+            after.0[low] |= moved[low..low + most].iter().fold(0, |all, row| all | row);
+            after.0[high] |= moved[high + 1 - most..=high].iter().fold(0, |all, row| all | row);
         }
         after
+    }
+
+    /// Each of `rows` from the rows that a move straight up or down, a move within the row, and a diagonal move connect it with.
+    fn gathered(rows: RangeInclusive<i32>, straight: &Rows, level: &Rows, diagonal: &Rows) -> Self {
+        let mut places = Places::NONE;
+        for y in rows.map(|y| y as usize) {
+            places.0[y] = level[y] | straight[y - 3] | straight[y + 3] | diagonal[y - 2] | diagonal[y + 2];
+        }
+        places
     }
 
     /// The columns of `rows` after the [`MOVES`] that go straight up or down, stay in the row, or are diagonal.
@@ -133,7 +167,7 @@ impl Places {
         rows: RangeInclusive<i32>,
         aside: impl Fn(u128) -> u128,
         diagonal: impl Fn(u128) -> u128,
-    ) -> [[u128; SCREEN]; 3] {
+    ) -> [Rows; 3] {
         let mut moved = [[0; SCREEN]; 3];
         for y in rows.map(|y| y as usize) {
             let row = self.0[y] & WALKABLE;
@@ -188,8 +222,11 @@ impl Danger {
         Danger(Places::NONE)
     }
 
-    /// Adds all places in `rows` within `reach` pixels of `centre`.
-    pub fn add(&mut self, centre: [f64; 2], reach: f64, rows: RangeInclusive<i32>) {
+    /// Adds all places within `reach` pixels of `centre` in `rows`, or none if none is in `columns`.
+    pub fn add(&mut self, centre: [f64; 2], reach: f64, [columns, rows]: [RangeInclusive<i32>; 2]) {
+        if centre[0] + reach < f64::from(*columns.start()) || centre[0] - reach > f64::from(*columns.end()) {
+            return;
+        }
         let [first, last] = [centre[1] - reach, centre[1] + reach + 1.0].map(|y| y as i32);
         for y in first.max(*rows.start())..=last.min(*rows.end()) {
             let rest = reach * reach - (f64::from(y) - centre[1]).powi(2);
@@ -207,10 +244,6 @@ impl Danger {
             *row |= if inside { !bits(LOW[0] + BORDER, HIGH[0] - BORDER) } else { u128::MAX };
         }
     }
-
-    fn safe(&self) -> Places {
-        Places(self.0.0.map(|row| !row))
-    }
 }
 
 /// The goal: any place within `reach` pixels of `place`.
@@ -227,7 +260,7 @@ impl Goal {
 
     fn places(&self) -> Places {
         let mut danger = Danger::none();
-        danger.add(self.place.map(f64::from), f64::from(self.reach), LOW[1]..=HIGH[1]);
+        danger.add(self.place.map(f64::from), f64::from(self.reach), within(self.place, SCREEN));
         danger.0
     }
 }
@@ -244,13 +277,14 @@ pub(super) struct Plan {
 /// it; `None` if each path has one. `dangers` has an entry for the current step, which is ignored, and one for each future step.
 pub(super) fn unharmed(start: Place, goal: Goal, dangers: &[Danger]) -> Option<Plan> {
     let start = moved(start, [0, 0]);
-    let safe = survivable(start, dangers, None);
-    MOVES.iter().find(|(_, pixels)| safe[1].contains(moved(start, *pixels)))?;
-    let (reached, arrival) = walk(start, goal, &safe, None);
+    // Whether the rest of a path can be safe matters, and takes time to find out, only at the goal.
+    let mut rest = None;
+    let survivors =
+        |step, there: Places| there.and(&rest.get_or_insert_with(|| survivable(start, step, dangers, None))[step]);
+    let (reached, arrival) = walk(start, goal, dangers, None, survivors);
     let last = reached.len() - 1;
-    let end = arrival.or_else(|| reached[last].nearest(goal).map(|place| (last, place)));
-    let action = end.and_then(|(step, place)| first_action(step, place, 0, &[reached], &safe)).unwrap_or([0, 0]);
-    Some(Plan { action, arrives: arrival.is_some() })
+    let (step, place) = arrival.or_else(|| Some((last, reached[last].nearest(goal)?)))?;
+    Some(Plan { action: first_action(step, place, 0, &[reached], dangers)?, arrives: arrival.is_some() })
 }
 
 /// The first action of the path with the fewest dangerous steps up to the horizon, at least one, and the nearest to the goal among
@@ -259,9 +293,9 @@ pub(super) fn least_harmed(start: Place, goal: Goal, dangers: &[Danger]) -> [i32
     let start = moved(start, [0, 0]);
     let next = MOVES.map(|(action, pixels)| (action, moved(start, pixels)));
     // With as many hits as steps, every path is possible.
-    let mut allowed = survivable(start, dangers, None);
+    let mut allowed = survivable(start, 1, dangers, None);
     for _ in 1..dangers.len() {
-        allowed = survivable(start, dangers, Some(&allowed));
+        allowed = survivable(start, 1, dangers, Some(&allowed));
         let firsts = next.iter().filter(|(_, place)| allowed[1].contains(*place));
         if let Some((action, _)) = firsts.min_by_key(|(_, place)| goal.distance(*place)) {
             return *action;
@@ -270,21 +304,19 @@ pub(super) fn least_harmed(start: Place, goal: Goal, dangers: &[Danger]) -> [i32
     [0, 0]
 }
 
-/// For each step, the places within reach of `start` from which the rest of the path needs no dangerous step, or one more than from
-/// the places of `easier`.
-fn survivable(start: Place, dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
+/// For each step from `first`, the places within reach of `start` from which the rest of the path needs no dangerous step, or one
+/// more than from the places of `easier`.
+fn survivable(start: Place, first: usize, dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
     let mut sets = vec![Places::NONE; dangers.len()];
-    for step in (1..dangers.len()).rev() {
+    for step in (first..dangers.len()).rev() {
         let before = |sets: &[Places]| {
             let next = sets.get(step + 1);
             next.map_or(Places([u128::MAX; SCREEN]), |next| next.before(rows_within(start, step)))
         };
-        let mut set = before(&sets).and(&dangers[step].safe());
+        sets[step] = before(&sets).without(&dangers[step].0);
         if let Some(easier) = easier {
-            let hurt = before(easier).and(&dangers[step].0);
-            set.0.iter_mut().zip(&hurt.0).for_each(|(row, hurt)| *row |= hurt);
+            sets[step].extend(&before(easier).and(&dangers[step].0));
         }
-        sets[step] = set;
     }
     sets
 }
@@ -293,33 +325,38 @@ fn survivable(start: Place, dangers: &[Danger], easier: Option<&[Places]>) -> Ve
 /// Ignores what happens after the arrival.
 pub(super) fn dash(start: Place, goal: Goal, dangers: &[Danger], max_hits: usize) -> Option<[i32; 2]> {
     let start = moved(start, [0, 0]);
-    let safe: Vec<Places> = dangers.iter().map(Danger::safe).collect();
     // For each number of dangerous steps.
     let mut reached: Vec<Vec<Places>> = Vec::new();
     for hits in 0..=max_hits {
-        let (places, arrival) = walk(start, goal, &safe, reached.last().map(Vec::as_slice));
+        let (places, arrival) = walk(start, goal, dangers, reached.last().map(Vec::as_slice), |_, there| there);
         reached.push(places);
         if let Some((step, place)) = arrival {
-            return first_action(step, place, hits, &reached, &safe);
+            return first_action(step, place, hits, &reached, dangers);
         }
     }
     None
 }
 
-/// The places after each step on paths through `safe` places, or on those with one more dangerous step than the paths of `easier`,
-/// until one arrives: after which step, and where.
-fn walk(start: Place, goal: Goal, safe: &[Places], easier: Option<&[Places]>) -> (Vec<Places>, Option<(usize, Place)>) {
+/// The places after each step on paths without a dangerous step, or on those with one more dangerous step than the paths of `easier`,
+/// until one arrives at one of the goal's places that `accepted` keeps: after which step, and where.
+fn walk(
+    start: Place,
+    goal: Goal,
+    dangers: &[Danger],
+    easier: Option<&[Places]>,
+    mut accepted: impl FnMut(usize, Places) -> Places,
+) -> (Vec<Places>, Option<(usize, Place)>) {
     let goals = goal.places();
     let mut places = vec![if easier.is_none() { Places::only(start) } else { Places::NONE }];
-    for (step, safe) in safe.iter().enumerate().take(HORIZON + 1).skip(1) {
+    for (step, danger) in dangers.iter().enumerate().skip(1) {
         let rows = rows_within(start, step - 1);
-        let mut next = places[step - 1].after(rows.clone()).and(safe);
+        let mut next = places[step - 1].after(rows.clone()).without(&danger.0);
         if let Some(easier) = easier {
-            let hurt = easier[step - 1].after(rows).0;
-            next.0.iter_mut().zip(hurt.iter().zip(&safe.0)).for_each(|(next, (hurt, safe))| *next |= hurt & !safe);
+            next.extend(&easier[step - 1].after(rows).and(&danger.0));
         }
-        let arrival = next.clone().and(&goals).nearest(goal);
+        let there = next.clone().and(&goals);
         places.push(next);
+        let arrival = if there.is_empty() { None } else { accepted(step, there).nearest(goal) };
         if let Some(place) = arrival {
             return (places, Some((step, place)));
         }
@@ -333,10 +370,10 @@ fn first_action(
     mut place: Place,
     mut hits: usize,
     reached: &[Vec<Places>],
-    safe: &[Places],
+    dangers: &[Danger],
 ) -> Option<[i32; 2]> {
     loop {
-        hits -= usize::from(!safe[step].contains(place));
+        hits -= usize::from(dangers[step].0.contains(place));
         let before = reached.get(hits)?.get(step - 1)?;
         let near = (-3..=3).flat_map(|x| (-3..=3).map(move |y| [place[0] + x, place[1] + y]));
         let (from, action) = near.filter(|from| before.contains(*from)).find_map(|from| {
@@ -385,7 +422,7 @@ mod tests {
         let wall = |step: usize| {
             let mut danger = Danger::none();
             if step < 12 {
-                (0..84).step_by(4).for_each(|y| danger.add([40.0, f64::from(y)], 6.0, LOW[1]..=HIGH[1]));
+                (0..84).step_by(4).for_each(|y| danger.add([40.0, f64::from(y)], 6.0, within([40, y], SCREEN)));
             }
             danger
         };
