@@ -113,8 +113,9 @@ def test_the_page_has_scores_gates_and_longer_versions() -> None:
         for seed in (1, 2)
     ]
 
-    def page(rows: list[dict[str, Any]]) -> str:
-        return leaderboard.page(track, rows, leaderboard.compared(track, rows, Path("rows")), {})
+    def page(rows: list[dict[str, Any]], is_tuned: bool = True) -> str:
+        tuning = {"gru -": {"trials": [{}]}} if is_tuned else {}
+        return leaderboard.page(track, rows, leaderboard.compared(track, rows, Path("rows")), tuning)
 
     made = page(rows)
     assert "| `gru` | 2 | 1.00 [1.00, 1.00] | 0.00 [0.00, 0.00] | 1.00 | 1.00 |" in made
@@ -122,6 +123,7 @@ def test_the_page_has_scores_gates_and_longer_versions() -> None:
     assert "| repeat-first | object | 1 | -0.500 | passed |" in made
     assert "| `gru` | 0.10 → 0.05 | 1.00 → 0.50 |" in made
     assert "Which memory" not in made
+    assert "| `gru` 1.00 [1.00, 1.00], `none` 0.00 [0.00, 0.00]; no rows of `gated-deltanet`, `mamba2` |" in made
     # Five runs show that the GRU is better with commands, but not that another is with cards; the cheapest of two is named.
     scores = {"none": ((0.0, 0.0), (0.0, 0.0)), "gru": ((0.1, 0.1), (0.5, 0.1)), "lru": ((0.05, 0.05), (0.1, 0.4))}
     fives = [
@@ -133,6 +135,7 @@ def test_the_page_has_scores_gates_and_longer_versions() -> None:
     told = page(fives)
     assert "| one-command | object | `gru` 1.00 |  | `gru` 60 |" in told
     assert "| repeat-first | object | `gru` 0.34 | `lru` | `lru` 20 |" in told
+    assert "Which memory" not in page(fives, is_tuned=False)
     # An agent with holes has no mean, and a task without zero is left out.
     assert "| `gru` | 1-2 | incomplete |  | 1.00 | 1.00 |" in page(rows[:-1])
     assert (

@@ -124,6 +124,7 @@ class Track:
         sizes: Flags by size and agent, or `other` for the agents that are not named; empty for one size.
         evaluation: As in an experiment of `endless-reproduce`.
         tuning: How the flags of each agent are chosen; empty for no choice.
+        published: Results of others, each with its `source`, what it has `found`, and which `agents` of the track it compares.
         rows: The rows, and the trials of the tuning by agent and size, that the package has.
     """
 
@@ -138,6 +139,7 @@ class Track:
     sizes: dict[str, dict[str, Flags]]
     evaluation: dict[str, int]
     tuning: dict[str, Any]
+    published: list[dict[str, Any]]
     rows: dict[str, Any]
 
     def run(self, task: Task, entry: Entry, size: str, chosen: Mapping[str, Any] | None = None) -> tuple[Task, Flags]:
@@ -199,6 +201,7 @@ def read(name: str) -> Track:
         given.get("sizes", {}),
         {"interval": 1_000_000, **given.get("evaluation", {})},
         given.get("tuning", {}),
+        [_checked(each, "source", ("found", "agents"), where) for each in given.get("published", [])],
         json.loads(rows.read_text()) if rows.exists() else {},
     )
 
@@ -435,7 +438,8 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
         "",
         "![comparison](comparison.svg)",
         "",
-        *answers(track, comparison),
+        *(answers(track, comparison) if tuning else ()),
+        *orders(track, comparison),
         *compare.markdown(comparison, "## Agents"),
         *longer_table(track, rows),
     ]
@@ -487,6 +491,26 @@ def answers(track: Track, comparison: Comparison) -> list[str]:
         "one half. Not known: other budgets, sizes and tasks, frames in place of features, and other configurations.",
         "",
         *tables.markdown(columns | {"cheapest of these, core-seconds": False}, rows),
+        "",
+    ]
+
+
+def orders(track: Track, comparison: Comparison) -> list[str]:
+    """What others have published, beside the order of the same agents here; no lines without such results."""
+    if not track.published:
+        return []
+    rows = []
+    for each in track.published:
+        agents, found = each.get("agents", []), comparison.aggregates
+        here = ", ".join(f"`{agent}` {found[agent].iqm}" for agent in found if agent in agents)
+        missing = ", ".join(f"`{agent}`" for agent in agents if agent not in found)
+        rows.append([each["source"], each.get("found", ""), here + (f"; no rows of {missing}" if missing else "")])
+    return [
+        "## Beside published results",
+        "",
+        "Observations, tasks, sizes and lengths of training differ, so only orders can be compared.",
+        "",
+        *tables.markdown({"source": False, "published": False, "interquartile means here": False}, rows),
         "",
     ]
 
