@@ -40,6 +40,7 @@ const FEATURE_INFINITE: u8 = 14;
 const TRUTH_OUTSIDE: u8 = 15;
 const ALLOCATES: u8 = 16;
 const FORGERY_ACCEPTED: u8 = 17;
+const PICTURE_PANICS: u8 = 18;
 
 /// Numbers that belong to no environment.
 static RESETS: AtomicI64 = AtomicI64::new(0);
@@ -66,8 +67,11 @@ impl<const MISTAKE: u8> Task for Sum<MISTAKE> {
     type Parameters = i64;
 
     fn spec() -> EnvSpec {
+        let shape = Some(FrameShape::rgb(100, 10));
+        let (frame, picture) = if MISTAKE == PICTURE_PANICS { (None, shape) } else { (shape, None) };
         EnvSpec {
-            frame: Some(FrameShape::rgb(100, 10)),
+            frame,
+            picture,
             features: FEATURES,
             observation_space: Some(ObservationSpace::Discrete(100)),
             ground_truth: TRUTH,
@@ -130,6 +134,7 @@ impl<const MISTAKE: u8> Task for Sum<MISTAKE> {
     }
 
     fn paint(&self, _: &i64, canvas: &mut Canvas<'_>) {
+        assert!(MISTAKE != PICTURE_PANICS || self.sum < 50, "too far to the right");
         canvas.draw_rect([200; 3], Rect::new(self.sum as i32, 2, 5, 5), 0);
     }
 
@@ -181,6 +186,7 @@ fn each_seeded_mistake_is_found() {
         (problems::<Sum<THREAD_MATTERS>>(), "with three threads"),
         (problems::<Sum<FORGERY_ACCEPTED>>(), "`is_valid` accepts a snapshot with the bytes "),
         (problems::<Sum<FEATURE_INFINITE>>(), "the feature `sum` is"),
+        (problems::<Sum<PICTURE_PANICS>>(), "too far to the right"),
     ];
     for (problems, expected) in found {
         assert!(problems.iter().any(|problem| problem.contains(expected)), "expected {expected}, found {problems:?}");

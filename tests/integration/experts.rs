@@ -97,13 +97,20 @@ fn config(id: &str, autoreset: Autoreset) -> PoolConfig {
     PoolConfig::new(id, NUM_ENVS).features(true).frames(None).autoreset(autoreset).seeding(seeding)
 }
 
+/// More steps than these episodes take.
+const MAX_STEPS: usize = 20_000;
+
 /// Plays until every environment has ended [`EPISODES`] episodes.
 fn play_pool(id: &str, autoreset: Autoreset) -> Episodes {
     let mut player = Player::started(&config(id, autoreset));
     let mut experts = Experts::new(memory_gym(), id, NUM_ENVS, autoreset).unwrap();
     let mut actions = vec![0; NUM_ENVS * player.pool.spec().action_space.width()];
     let mut episodes = Episodes::default();
-    while episodes.iter().any(|episodes| episodes.len() < EPISODES) {
+    for step in 0.. {
+        if episodes.iter().all(|episodes| episodes.len() >= EPISODES) {
+            break;
+        }
+        assert!(step < MAX_STEPS, "{id}, {autoreset}: no more episodes end");
         experts.act(&player.batch(), &mut actions).unwrap();
         player.step(&actions);
         let batch = player.batch();

@@ -7,9 +7,12 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::support::place::Place;
+use crate::support::player::Player;
 use crate::support::process::{Process, pseudo_terminal, text, wait_until};
 use crate::support::recorded::traces;
 use crate::support::service::reset;
+use endless_gym::pool::{PoolConfig, ResetRequest};
+use endless_gym::popgym;
 use endless_gym::service::{EngineStatus, running_engines};
 use rustix::process::Signal;
 use serde_json::Value as Json;
@@ -201,6 +204,20 @@ fn serve_serves_until_a_signal_and_leaves_nothing() {
         assert!(engine.wait().success());
         assert!(engine.output().starts_with("serving MortarMayhem-v0 as `one`"));
         place.assert_nothing_left();
+    }
+}
+
+#[test]
+fn serve_writes_the_markov_state_if_asked() {
+    let id = "popgym-RepeatPreviousEasy-v0";
+    let mut twin = Player::in_registry(popgym(), &PoolConfig::new(id, 3).state(true), 1);
+    twin.reset(ResetRequest::Seed(3));
+    for (arguments, expected) in [(&["--state"][..], twin.batch().state()), (&[], &[])] {
+        let place = Place::new();
+        let _engine = place.serve(&[&["--env", id, "--num-envs", "3"], arguments].concat());
+        let mut trainer = place.trainer("endless").unwrap();
+        assert_eq!(reset(&mut trainer, 0).batch().state(), expected);
+        assert_eq!(arguments.is_empty(), expected.is_empty());
     }
 }
 
