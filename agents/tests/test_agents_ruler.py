@@ -19,8 +19,10 @@ from endless_gym_agents.environments import wrappers
 from endless_gym_agents.evaluation import conformance, enjoy, ruler
 from endless_gym_agents.evaluation.evaluate import evaluate
 from endless_gym_agents.evaluation.ruler import TASKS
-from endless_gym_agents.paper import leaderboard
+from endless_gym_agents.paper import leaderboard, reproduce
 from endless_gym_agents.paper.experiments.definitions import settings_of
+from endless_gym_agents.paper.track import MEMORYLESS, Entry, read_track, trials
+from endless_gym_agents.paper.track_page import compared, page
 from endless_gym_agents.training import checkpoint
 from endless_gym_agents.training import train as training
 
@@ -65,18 +67,16 @@ def test_a_twin_shows_the_state(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["million", "full"])
 def test_the_agents_of_a_size_have_as_many_parameters_as_that_of_the_gru(name: str) -> None:
-    track = leaderboard.read(name)
+    track = read_track(name)
     assert set(track.tasks) <= TASKS.keys()
     for size in track.sizes:
         counts = {}
         for entry, _ in track.sized([one for one in track.agents.values() if not one.observable], [size]):
-            task, flags = track.run(
-                TASKS["three-commands"], entry, "-" if entry.agent in leaderboard.MEMORYLESS else size
-            )
+            task, flags = track.run(TASKS["three-commands"], entry, "-" if entry.agent in MEMORYLESS else size)
             given = settings_of(task.env, flags).validated()
             with torch.device("meta"):
                 counts[given.agent] = make_agent(given, spec(given.env), "meta").num_parameters
-        for agent in counts.keys() - set(leaderboard.MEMORYLESS):
+        for agent in counts.keys() - set(MEMORYLESS):
             assert counts[agent] == pytest.approx(counts["gru"], rel=0.05), (size, agent)
 
 
@@ -105,7 +105,7 @@ def mean_row(agent: str, task: str, seed: int, score: float) -> dict[str, Any]:
 
 
 def test_the_page_has_scores_gates_and_longer_versions() -> None:
-    track = replace(leaderboard.read("million"), tasks={name: TASKS[name] for name in ("one-command", "repeat-first")})
+    track = replace(read_track("million"), tasks={name: TASKS[name] for name in ("one-command", "repeat-first")})
     rows = [
         mean_row(agent, task, seed, score)
         for agent, scores in {"none": (0.02, -0.5), "gru": (0.1, 1.0)}.items()
@@ -113,11 +113,11 @@ def test_the_page_has_scores_gates_and_longer_versions() -> None:
         for seed in (1, 2)
     ]
 
-    def page(rows: list[dict[str, Any]], is_tuned: bool = True) -> str:
+    def made_of(rows: list[dict[str, Any]], is_tuned: bool = True) -> str:
         tuning = {"gru -": {"trials": [{}]}} if is_tuned else {}
-        return leaderboard.page(track, rows, leaderboard.compared(track, rows, Path("rows")), tuning)
+        return page(track, rows, compared(track, rows, Path("rows")), tuning)
 
-    made = page(rows)
+    made = made_of(rows)
     assert "| `gru` | 2 | 1.00 [1.00, 1.00] | 0.00 [0.00, 0.00] | 1.00 | 1.00 |" in made
     assert "| `none` | 2 | 0.00 [0.00, 0.00] | 1.00 [1.00, 1.00] | 0.00 | 0.00 |" in made
     assert "| repeat-first | object | 1 | -0.500 | passed |" in made
@@ -132,20 +132,20 @@ def test_the_page_has_scores_gates_and_longer_versions() -> None:
         for task, both in zip(track.tasks, of_tasks, strict=True)
         for seed in range(5)
     ]
-    told = page(fives)
+    told = made_of(fives)
     assert "| one-command | object | `gru` 1.00 |  | `gru` 60 |" in told
     assert "| repeat-first | object | `gru` 0.34 | `lru` | `lru` 20 |" in told
-    assert "Which memory" not in page(fives, is_tuned=False)
+    assert "Which memory" not in made_of(fives, is_tuned=False)
     # An agent with holes has no mean, and a task without zero is left out.
-    assert "| `gru` | 1-2 | incomplete |  | 1.00 | 1.00 |" in page(rows[:-1])
+    assert "| `gru` | 1-2 | incomplete |  | 1.00 | 1.00 |" in made_of(rows[:-1])
     assert (
         "repeat-first |"
-        not in page([row for row in rows if row["agent"] == "gru" or row["task"] == "one-command"]).split(
+        not in made_of([row for row in rows if row["agent"] == "gru" or row["task"] == "one-command"]).split(
             "Mean returns"
         )[0]
     )
     with pytest.raises(ValueError, match="needs the runs of `none` in a task, or a `zero`"):
-        page([row for row in rows if row["agent"] == "gru"])
+        made_of([row for row in rows if row["agent"] == "gru"])
 
 
 TRACK: dict[str, Any] = {
@@ -180,6 +180,15 @@ def written(folder: Path, **changes: Any) -> Path:
     return file
 
 
+def test_another_command_in_the_same_folder_does_not_change_what_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    track, out = read_track(str(written(tmp_path))), tmp_path / "out"
+    monkeypatch.setattr(reproduce, "execute", lambda _: next(out.glob("*.runs.json")).write_text("{}"))
+    runs = {"one": track.run(TASKS["one-command"], track.agents["none"], "-")}
+    assert leaderboard.trained(track, "runs", runs, [1], leaderboard.LeaderboardArguments("", out=out)) == ([], None)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -199,13 +208,13 @@ def written(folder: Path, **changes: Any) -> Path:
 )
 def test_mistakes_in_a_track_are_named(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=re.escape(message).replace(r"\.\*", ".*")):
-        leaderboard.read(str(written(tmp_path, **changes)))
+        read_track(str(written(tmp_path, **changes)))
 
 
 def test_all_agents_are_tuned_with_the_same_common_choices(tmp_path: Path) -> None:
-    track = leaderboard.read(str(written(tmp_path, agents=["none", "gru", "lru"], tuning=TUNING)))
+    track = read_track(str(written(tmp_path, agents=["none", "gru", "lru"], tuning=TUNING)))
     assert track.tasks["two"].expert == pytest.approx(0.2)  # played by the environment's expert
-    found = {name: leaderboard.trials(track, entry) for name, entry in track.agents.items()}
+    found = {name: trials(track, entry) for name, entry in track.agents.items()}
     common = ("ppo.learning-rate", "ppo.entropy-coefficient")
     assert [len(one) for one in found.values()] == [3, 3, 3]
     for one in found.values():
@@ -218,10 +227,10 @@ def test_all_agents_are_tuned_with_the_same_common_choices(tmp_path: Path) -> No
     }
     assert found["lru"][0]["agent-option"] == []
     # A memory of your own has choices of its own, and no more trials than there are choices.
-    mine = leaderboard.Entry("mine", {"agent": "mine.py:Mine"})
-    assert "agent-option" in leaderboard.trials(track, mine, {"agent-option": [["a=1"], ["a=2"]]})[0]
+    mine = Entry("mine", {"agent": "mine.py:Mine"})
+    assert "agent-option" in trials(track, mine, {"agent-option": [["a=1"], ["a=2"]]})[0]
     small = replace(track, tuning=TUNING | {"trials": 99})
-    assert len(leaderboard.trials(small, track.agents["none"])) == 4
+    assert len(trials(small, track.agents["none"])) == 4
 
 
 @pytest.mark.usefixtures("in_process")
@@ -305,8 +314,8 @@ def test_an_agent_enters_a_track_of_the_package(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_rows_of_the_package_have_equal_budgets() -> None:
-    track = leaderboard.read("million")
-    comparison = leaderboard.compared(track, track.rows["rows"], Path("million"))
+    track = read_track("million")
+    comparison = compared(track, track.rows["rows"], Path("million"))
     assert {"none", "gru"} <= set(comparison.aggregates) <= track.agents.keys()
 
 
@@ -332,5 +341,5 @@ def test_the_page_from_idea_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyP
     # The part of a track about tuning is one, too.
     (tuning,) = re.findall(r"```text\n(.*?)```", text, re.S)
     Path("tuned.json").write_text(json.dumps(track | json.loads(f"{{{tuning}}}")))
-    tuned = leaderboard.read("tuned.json")
-    assert [len(leaderboard.trials(tuned, entry)) for entry in tuned.agents.values()] == [6, 8, 8, 8]
+    tuned = read_track("tuned.json")
+    assert [len(trials(tuned, entry)) for entry in tuned.agents.values()] == [6, 8, 8, 8]
