@@ -280,7 +280,10 @@ def test_a_track_of_your_own_is_tuned_resumed_and_extended(
 @pytest.mark.usefixtures("in_process")
 def test_a_track_has_the_gap_to_fully_observable_twins(tmp_path: Path) -> None:
     wide = TRACK["agents"][1]
-    file = written(tmp_path, agents=["none", wide, wide | {"name": "twin", "observable": True}], tasks=["one-command"])
+    agents = ["none", wide, wide | {"name": "twin", "observable": True}]
+    # Agents of the twins are tuned on a twin, too, whose longer version they cannot observe.
+    tuning = {"task": "two-commands", "trials": 1, "space": {"ppo.learning-rate": [1e-3]}}
+    file = written(tmp_path, agents=agents, tasks=["one-command"], tuning=tuning)
     leaderboard.execute(leaderboard.LeaderboardArguments(str(file), device="cpu", jobs=1, out=tmp_path / "out"))
     assert (tmp_path / "out/runs/MortarMayhemB-Grid-v0/one-command twin -/seed-1").is_dir()
     rows = json.loads((tmp_path / "out/mine/results.json").read_text())["rows"]

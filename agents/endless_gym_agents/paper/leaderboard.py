@@ -139,7 +139,7 @@ def tuned(track: Track, entries: Sequence[Entry], data: dict[str, Any], argument
         for number, flags in enumerate(planned[entry.name, size])
     }
     done, failure = trained(track, "tuning", runs, [track.tuning.get("seed", 0)], arguments)
-    results = {job.run.name: row(job, task) for job in done}
+    results = {job.run.name: row(job, runs[job.run.name][0]) for job in done}
     for (name, size), flags in planned.items():
         found = [results.get(f"{name} {size} trial-{number}") for number in range(len(flags))]
         if any(one is None for one in found):
