@@ -152,7 +152,7 @@ impl Places {
         after
     }
 
-    /// Each of `rows` from the rows that a move straight up or down, a move within the row, and a diagonal move connect it with.
+    /// Each of `rows` joined with the rows that straight, level and diagonal moves connect it with.
     fn gathered(rows: RangeInclusive<i32>, straight: &Rows, level: &Rows, diagonal: &Rows) -> Self {
         let mut places = Places::NONE;
         for y in rows.map(|y| y as usize) {
@@ -277,7 +277,7 @@ pub(super) struct Plan {
 /// it; `None` if each path has one. `dangers` has an entry for the current step, which is ignored, and one for each future step.
 pub(super) fn unharmed(start: Place, goal: Goal, dangers: &[Danger]) -> Option<Plan> {
     let start = moved(start, [0, 0]);
-    // Whether the rest of a path can be safe matters, and takes time to find out, only at the goal.
+    // Whether a path can go on without a hit is needed only at the goal, and takes a pass over all later steps.
     let mut rest = None;
     let survivors =
         |step, there: Places| there.and(&rest.get_or_insert_with(|| survivable(start, step, dangers, None))[step]);
