@@ -138,7 +138,7 @@ def read_track(name: str) -> Track:
         given.get("sizes", {}),
         {"interval": 1_000_000, **given.get("evaluation", {})},
         given.get("tuning", {}),
-        [_checked(each, "source", ("found", "agents"), where) for each in given.get("published", [])],
+        [_checked(each, "source", ("found", "agents"), f"{where}, published") for each in given.get("published", [])],
         json.loads(rows.read_text()) if rows.exists() else {},
     )
 
