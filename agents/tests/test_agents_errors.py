@@ -114,7 +114,7 @@ PROGRAMS = {
             "MysteryPath-v0 .* lacks runs of `none` and an expert: --range",
         ),
         ("endless-compare one.json --metric task_progress --range a=1,2", "--range: no runs of task `a`; there are "),
-        ("endless-leaderboard nope", "track must be one of full, million, or a JSON file; got `nope`"),
+        ("endless-leaderboard nope", "track must be one of ablations, full, million, or a JSON file; got `nope`"),
         ("endless-leaderboard nope.json", r"\[Errno 2\] No such file or directory: 'nope.json'"),
         ("endless-leaderboard text.json", "track text: `tasks` is unknown, missing or empty; allowed: about, tasks"),
         ("endless-leaderboard million --tasks nope", "--tasks must be among repeat-first-12, .*, got `nope`"),
