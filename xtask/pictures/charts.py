@@ -254,8 +254,8 @@ def hour(folder: Path) -> None:
     """Curves of the runs of `agents/benches/hour.py`, from the files in its folder and into it."""
     environments: dict[str, list[dict[str, Any]]] = {}
     for file in sorted(folder.glob("*.json")):
-        run = json.loads(file.read_text())
-        environments.setdefault(run["env"], []).append(run)
+        data = json.loads(file.read_text())
+        environments.setdefault(data["env"], []).append(data)
 
     def draw(figure: Figure, theme: Theme) -> None:
         titles = [f"{env}, {own[0]['metric'].replace('_', ' ')}" for env, own in environments.items()]
@@ -263,9 +263,9 @@ def hour(folder: Path) -> None:
         for axes, own in zip(panels(figure, theme, titles, agents), environments.values(), strict=True):
             for agent, score in own[0]["paper"].items():
                 axes.axhline(score, color=theme.agents[agent], lw=0.8, ls="--")
-            for run in own:
+            for agent, run in ((data["agent"], run) for data in own for run in data["runs"]):
                 minutes, _, values = np.array(run["curve"]).T
-                axes.plot(minutes, values, color=theme.agents[run["agent"]], lw=1.6)
+                axes.plot(minutes, values, color=theme.agents[agent], lw=1.2)
             axes.set(xlim=(0, None), ylim=(0, None))
         height = figure.get_figheight()
         figure.subplots_adjust(0.06, 0.3 / height, 0.985, 1 - 0.95 / height, wspace=0.13, hspace=0.5)

@@ -147,7 +147,8 @@ def longer_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> list[str]:
         own = [one for agent, one in named if (agent, one["task"]) == (name, task) and one["longer"] is not None]
         return " → ".join(f"{statistics.mean(one[key] for one in own):.2f}" for key in ("score", "longer") if own)
 
-    shown = [[name, *(means(name, task.name) for task, _ in versions)] for name in dict.fromkeys(n for n, _ in named)]
+    agents = dict.fromkeys(agent for agent, one in named if one["longer"] is not None)
+    shown = [[name, *(means(name, task.name) for task, _ in versions)] for name in agents]
     about = "Mean returns in a task, and after the arrow in a longer version of it, in which the agent did not train:"
     columns = ["agent", *(f"{task.name} → `{version}`" for task, version in versions)]
     return [about, "", *compare.markdown_table(columns, shown), ""]
