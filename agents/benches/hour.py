@@ -85,7 +85,9 @@ def run(task: str, agent: str, seed: int, scale: float, out: Path) -> dict[str, 
     minutes, steps, points, commands, former = 0.0, 0, [], [], None
     for number, (updates, flags) in enumerate(stages, start=1):
         folder = out / f"{task}-{agent}-{seed}-{number}"
-        flags = f"--agent {agent} --seed {seed} {FLAGS} {AGENTS[agent]} {flags} --ppo.updates {updates * scale:.0f}"
+        updates = round(updates * scale)
+        flags = f"--agent {agent} --seed {seed} {FLAGS} {AGENTS[agent]} {flags}"
+        flags += f" --ppo.updates {updates} --ppo.decay-updates {updates}"
         commands.append(stage(folder, env, flags, former))
         # The first checkpoint of a later stage has the weights of the last one.
         for time, count, value in curve(folder)[number > 1 :]:
