@@ -20,6 +20,7 @@ PAGES = {
     "reference/changes.md": "CHANGELOG.md",
     "train/learning.md": "agents/benches/learning/README.md",
     "train/leaderboard.md": "agents/benches/leaderboard/million/README.md",
+    "train/ablations/index.md": "agents/benches/leaderboard/ablations/README.md",
     "train/hour.md": "agents/benches/hour/README.md",
 }
 
