@@ -1,5 +1,5 @@
-//! What a learner computes on the CPU, with gradients: layers (fully connected, GRU, LSTM, minGRU, layer normalisation), categorical
-//! policies, the losses of PPO, AdamW, orthogonal initial weights, the [`network`] of an agent made of these layers, and its [`file`](mod@file).
+//! What a learner computes on the CPU, with gradients: layers (fully connected, GRU, LSTM, minGRU), categorical policies, the
+//! losses of PPO, AdamW, orthogonal initial weights, the [`network`] of an agent made of these layers, and its [`file`](mod@file).
 //!
 //! The module of a layer has the functions `forward` and `backward`, with its equations. The caller owns all memory: weights,
 //! outputs, gradients, and workspaces, which grow in the first call. Later calls with the same shapes do not allocate. Numbers are
@@ -16,7 +16,6 @@ pub mod categorical;
 pub mod file;
 pub mod functions;
 pub mod gru;
-pub mod layer_norm;
 pub mod linear;
 pub mod lstm;
 pub mod matrix;

@@ -24,11 +24,6 @@ def main() -> None:
     """Compute and write."""
     recorded: dict[str, Tensor] = {}
 
-    x, weight, bias = leaf(12, 1, 3, 4), leaf(4, 2, 4), leaf(4, 3, 4)
-    y = nn.functional.layer_norm(x, (4,), weight, bias)
-    gradients = torch.autograd.grad(y, (x, weight, bias), numbers(12, 4).view(3, 4))
-    recorded |= dict(zip(("NORM", "NORM_X", "NORM_WEIGHT", "NORM_BIAS"), (y, *gradients), strict=True))
-
     logits, actions = leaf(15, 5, 3, 5), torch.tensor([[2, 0], [1, 1], [0, 0]])
     log_probs = [part.log_softmax(-1) for part in logits.split(CHOICES, 1)]
     taken = torch.cat([part.gather(1, actions[:, [i]]) for i, part in enumerate(log_probs)], 1)
