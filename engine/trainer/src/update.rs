@@ -296,7 +296,7 @@ mod tests {
                              --recurrence.sequence-length 12 --recurrence.hidden-size 16 --recurrence.layers 2 --agent";
 
     #[test]
-    fn whole_sequences_have_ratios_of_one_and_the_gradients_of_sequences_cut_at_episodes() {
+    fn whole_sequences_have_the_probabilities_of_acting() {
         for agent in ["gru", "mingru"] {
             let command = Settings::augment_args(Command::new("learn"));
             let arguments = ARGUMENTS.split_whitespace().chain([agent]);
@@ -323,36 +323,8 @@ mod tests {
             assert_eq!((taken, &whole.values), (of(&segment.log_probs), &of(&segment.values)), "{agent}");
             assert_eq!(losses[4..], [0.0, 0.0]);
 
-            let (count, size) = (firsts.len(), network.spec.hidden_size);
-            assert!(resets[count..].iter().filter(|reset| **reset).count() > 8);
-            let (mut sums, mut alone) = (vec![0.0; whole.gradients.len()], Pass::default());
-            for sequence in 0..count {
-                let mut start = 0;
-                let ends = (1..=length).filter(|end| *end == length || resets[end * count + sequence]);
-                for end in ends {
-                    let steps: Vec<_> = (start..end).map(|step| step * count + sequence).collect();
-                    gather(&steps, &whole.observations, width, &mut alone.observations);
-                    gather(&steps, &whole.grad_logits, whole.logits.len() / rows.len(), &mut alone.grad_logits);
-                    gather(&steps, &whole.grad_values, 1, &mut alone.grad_values);
-                    let state = |state: &Vec<f32>| match resets[steps[0]] {
-                        true => vec![0.0; size],
-                        false => state[sequence * size..][..size].to_vec(),
-                    };
-                    alone.states = whole.states.iter().map(state).collect();
-                    let no_resets = vec![false; steps.len()];
-                    let cut = Sequences::new(1, &no_resets).unwrap();
-                    network.forward(cut, &mut alone);
-                    network.backward(cut, &mut alone);
-                    assert!(steps.iter().map(|step| whole.values[*step]).eq(alone.values.iter().copied()), "{agent}");
-                    sums.iter_mut().zip(&alone.gradients).for_each(|(sum, gradient)| *sum += gradient);
-                    start = end;
-                }
-            }
-            for tensor in &network.tensors {
-                let (sums, whole) = (&sums[tensor.range.clone()], &whole.gradients[tensor.range.clone()]);
-                let scale = whole.iter().fold(0.0, |largest: f32, gradient| largest.max(gradient.abs()));
-                assert!(sums.iter().zip(whole).all(|(a, b)| (a - b).abs() <= 1e-6 * scale), "{agent} {}", tensor.name);
-            }
+            // Episodes start within sequences.
+            assert!(resets[firsts.len()..].iter().filter(|reset| **reset).count() > 8);
         }
     }
 }
