@@ -302,27 +302,6 @@ fn episodes_within_sequences_equal_sequences_of_their_own() {
 }
 
 #[test]
-fn steps_one_by_one_equal_whole_sequences() {
-    let (mut random, count, length, units) = (Generator::from_seed(6), 7, 9, 21);
-    for layer in &LAYERS {
-        let resets: Vec<bool> = (0..count * length).map(|_| random.integers(0, 4) == 0).collect();
-        let sequences = Sequences::new(count, &resets).unwrap();
-        let (mut arguments, mut memory) = random_case(layer, sequences, units, &mut random);
-        (layer.forward)(sequences, &arguments, &mut memory);
-        let inputs = arguments[0].clone();
-        for (t, resets) in resets.chunks(count).enumerate() {
-            let step = Sequences::new(count, resets).unwrap();
-            let (_, mut now) = random_case(layer, step, units, &mut random);
-            arguments[0] = every(&inputs, count * length, t * count, 1, count);
-            (layer.forward)(step, &arguments, &mut now);
-            assert_eq!(now.outputs, memory.outputs[t * count * units..][..count * units], "{}, step {t}", layer.name);
-            let states = arguments.iter_mut().zip(layer.arguments).filter(|(_, shape)| matches!(shape, State));
-            states.zip([now.outputs, now.cells]).for_each(|((state, _), after)| *state = after);
-        }
-    }
-}
-
-#[test]
 fn calls_do_not_allocate_once_the_workspace_has_grown() {
     let mut random = Generator::from_seed(5);
     let sequences = Sequences::new(3, &[false; 9]).unwrap();
