@@ -5,12 +5,11 @@
 
 /// Replaces logits by log-probabilities: `l_i = x_i - log sum_j exp(x_j)`, within each branch.
 pub fn log_softmax(logits: &mut [f32], choices: &[usize]) {
-    for row in logits.chunks_exact_mut(choices.iter().sum()) {
-        for branch in branches(row, choices) {
-            let largest = branch.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-            let log_sum = branch.iter().map(|x| (x - largest).exp()).sum::<f32>().ln() + largest;
-            branch.iter_mut().for_each(|x| *x -= log_sum);
-        }
+    for (start, size) in starts(logits.len(), choices) {
+        let branch = &mut logits[start..start + size];
+        let largest = branch.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let log_sum = branch.iter().map(|x| (x - largest).exp()).sum::<f32>().ln() + largest;
+        branch.iter_mut().for_each(|x| *x -= log_sum);
     }
 }
 
@@ -66,15 +65,6 @@ pub fn backward(
         }
         grad[actions[i]] += grad_taken[i];
     }
-}
-
-/// The branches of a row.
-fn branches<'a>(mut row: &'a mut [f32], choices: &'a [usize]) -> impl Iterator<Item = &'a mut [f32]> {
-    choices.iter().map(move |size| {
-        let (branch, rest) = std::mem::take(&mut row).split_at_mut(*size);
-        row = rest;
-        branch
-    })
 }
 
 /// The first index and the size of each branch of each row of a matrix with `length` numbers.
