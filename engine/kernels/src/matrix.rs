@@ -327,18 +327,36 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tiles_of_both_widths_give_the_same_bits() {
+    fn every_number_of_a_product_is_the_sum_of_its_terms_in_order() {
         let numbers = |count: usize| (0..count).map(|i| (i as f32 * 0.7).sin()).collect::<Vec<f32>>();
+        let at = |matrix: Matrix, row, column| matrix.data[row * matrix.row_stride + column * matrix.column_stride];
+        let mut packed = Packed::default();
         for (rows, depth, columns) in [(1, 1, 1), (50, 3, 31), (7, 260, 33), (64, 64, 48), (97, 300, 50)] {
-            let (left, right) = (numbers(rows * depth), numbers(depth * columns));
-            let mut packed = Packed::default();
-            packed.pack(Matrix::new(&right, columns));
-            for left in [Matrix::new(&left, depth), Matrix::new(&left, rows).t()] {
-                let (mut narrow, mut wide) = (numbers(rows * columns), numbers(rows * columns));
-                compute_blocks_with::<1>(&mut narrow, Start::Result, left, &packed);
-                compute_blocks_with::<2>(&mut wide, Start::Result, left, &packed);
-                assert_eq!(narrow, wide, "{rows} x {depth} x {columns}");
+            let (left, right, start) = (numbers(rows * depth), numbers(depth * columns), numbers(rows * columns));
+            for right in [Matrix::new(&right, columns), Matrix::new(&right, depth).t()] {
+                packed.pack(right);
+                for left in [Matrix::new(&left, depth), Matrix::new(&left, rows).t()] {
+                    let sum = |(i, start): (usize, &f32)| {
+                        let (row, column) = (i / columns, i % columns);
+                        (0..depth).fold(*start, |sum, k| at(left, row, k).mul_add(at(right, k, column), sum))
+                    };
+                    let expected: Vec<f32> = start.iter().enumerate().map(sum).collect();
+                    // The tiles of this CPU, and those of both widths.
+                    for add in [add_product, add_narrow, add_wide] {
+                        let mut found = start.clone();
+                        add(&mut found, left, &packed);
+                        assert_eq!(found, expected, "{rows} x {depth} x {columns}");
+                    }
+                }
             }
         }
+    }
+
+    fn add_narrow(sum: &mut [f32], left: Matrix, right: &Packed) {
+        compute_blocks_with::<1>(sum, Start::Result, left, right);
+    }
+
+    fn add_wide(sum: &mut [f32], left: Matrix, right: &Packed) {
+        compute_blocks_with::<2>(sum, Start::Result, left, right);
     }
 }

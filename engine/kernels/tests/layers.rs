@@ -1,9 +1,9 @@
-//! Products equal sums term by term, gradients equal finite differences, nothing passes the start of an episode, and calls do not
-//! allocate once their workspaces have grown.
+//! Gradients equal finite differences, nothing passes the start of an episode, and calls do not allocate once their workspaces have
+//! grown.
 
 use endless_gym_core::conformance::{CountingAllocator, allocations};
 use endless_gym_core::random::Generator;
-use endless_gym_kernels::matrix::{Matrix, Packed, add_product};
+use endless_gym_kernels::matrix::{Matrix, Packed};
 use endless_gym_kernels::sequences::{Sequences, Workspace};
 use endless_gym_kernels::{gru, linear, lstm, mingru};
 
@@ -16,33 +16,6 @@ fn normals(random: &mut Generator, count: usize) -> Vec<f32> {
 
 fn size(random: &mut Generator, high: i64) -> usize {
     random.integers(1, high + 1) as usize
-}
-
-#[test]
-fn every_number_of_a_product_is_the_sum_of_its_terms_in_order() {
-    let mut random = Generator::from_seed(1);
-    let mut packed = Packed::default();
-    for case in 0..200 {
-        let (m, k, n) =
-            (size(&mut random, 60), size(&mut random, if case % 8 == 0 { 600 } else { 40 }), size(&mut random, 50));
-        let (left, right, start) =
-            (normals(&mut random, m * k), normals(&mut random, k * n), normals(&mut random, m * n));
-        // Each matrix row by row, or transposed.
-        let (left_rows, right_rows) = (case % 2 == 0, case % 4 < 2);
-        let left_matrix = if left_rows { Matrix::new(&left, k) } else { Matrix::new(&left, m).t() };
-        packed.pack(if right_rows { Matrix::new(&right, n) } else { Matrix::new(&right, k).t() });
-        let mut sum = start.clone();
-        add_product(&mut sum, left_matrix, &packed);
-        for (i, sum) in sum.iter().enumerate() {
-            let (row, column) = (i / n, i % n);
-            let expected = (0..k).fold(start[i], |sum, j| {
-                let left = left[if left_rows { row * k + j } else { j * m + row }];
-                let right = right[if right_rows { j * n + column } else { column * k + j }];
-                left.mul_add(right, sum)
-            });
-            assert_eq!(*sum, expected, "({m}, {k}) times ({k}, {n}), row {row}, column {column}");
-        }
-    }
 }
 
 /// A number of random sequences and their resets: with or without episodes that start within them.
