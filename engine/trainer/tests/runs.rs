@@ -413,14 +413,6 @@ fn a_damaged_or_forged_checkpoint_is_an_error_and_takes_no_memory_for_what_it_cl
 }
 
 #[test]
-fn a_resumed_run_may_have_a_new_target() {
-    let folder = Folder::new("target");
-    let run = folder.run("run", "--ppo.updates 1");
-    try_run(&format!("--resume {} --ppo.updates 2 --target-reward 0.5", run.display())).unwrap();
-    assert_eq!(settings(&format!("--resume={}", run.display())).target_reward, Some(0.5));
-}
-
-#[test]
 fn presets_and_runs_to_resume_replace_defaults() {
     let paper =
         settings("MortarMayhem-v0 --preset=paper --recurrence.no-embedding --ppo.steps 64").validated().unwrap();
@@ -431,6 +423,9 @@ fn presets_and_runs_to_resume_replace_defaults() {
     let resumed = settings(&format!("--resume={}", run.display()));
     assert_eq!((resumed.environment.num_envs, resumed.time_limit, resumed.ppo.updates), (8, 0.0, 1));
     assert_eq!(resumed.environment.option, ["command_count=[1]", "arena_size=6"]);
+    // A new target is kept.
+    try_run(&format!("--resume {} --ppo.updates 2 --target-reward 0.5", run.display())).unwrap();
+    assert_eq!(settings(&format!("--resume={}", run.display())).target_reward, Some(0.5));
 }
 
 #[test]
