@@ -6,7 +6,6 @@ import platform
 import subprocess
 import sys
 import time
-import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -66,12 +65,6 @@ if sys.argv[2] == "page":
         address, _, link = url.partition("#")
         with urllib.request.urlopen(f"{address}engine.wasm") as answer:
             is_page = answer.read(4) == b"\0asm" and link == "env=SearingSpotlights-v0&seed=9&num_coins=%5B3%5D"
-        for header in ({"Host": "example.org"}, {"Origin": "http://example.org"}):
-            try:
-                urllib.request.urlopen(urllib.request.Request(address, headers=header))
-                is_page = False
-            except urllib.error.HTTPError as refused:
-                is_page &= refused.code == 403
         server.terminate()
     end = time.monotonic() + 60
     while not Path("opened").exists() and time.monotonic() < end:
