@@ -122,11 +122,14 @@ def test_an_interrupted_step_is_played_once() -> None:
         twin.reset()
         engine = envs._engine.pid
         stop(engine)
+        # Processes that a shell starts in the background ignore Ctrl-C.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         interrupt = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
         interrupt.start()
         with pytest.raises(KeyboardInterrupt):
             envs.step(ACTIONS)
         interrupt.join()
+        signal.signal(signal.SIGINT, before)
         found = envs.reconnect()
         assert not found.restarted and found.groups[0] == (1, None, "pending")
         with pytest.raises(RuntimeError, match="group 0 has a pending answer; call `recv`"):
