@@ -13,7 +13,7 @@ use crate::error::ServiceError;
 use crate::namespace::directory::Ipc;
 use crate::namespace::node::NamespaceNode;
 use crate::namespace::{descriptors, memory};
-use crate::protocol::ports::{self, EngineServices, OpenMode, PortError, RequestPublisher, ServiceNames};
+use crate::protocol::ports::{self, EngineServices, OpenMode, PortError, RequestPublisher};
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, StatusReader};
 use crate::protocol::wait::Doorbell;
@@ -46,24 +46,21 @@ impl EngineConnection {
     pub(crate) fn open(config: &ConnectConfig) -> Result<(Self, ServiceSpecification), ServiceError> {
         let (node, (requests, responses, to_engine, to_trainer), specification) =
             connect_to_engine(config, |node, specification| {
-                let names = ServiceNames::new(&specification.service, specification.incarnation);
-                let services = EngineServices { node, names, mode: OpenMode::Open };
+                let services = EngineServices { node, specification, mode: OpenMode::Open };
                 let groups = 0..specification.groups;
                 descriptors::reserve(descriptors::of_trainer(specification.groups))?;
                 // Publishers first: whoever owns the first one is the trainer.
-                let requests: Vec<_> = groups
-                    .clone()
-                    .map(|group| request_publisher(&services, group, specification))
-                    .collect::<Result<_, _>>()?;
+                let requests: Vec<_> =
+                    groups.clone().map(|group| request_publisher(&services, group)).collect::<Result<_, _>>()?;
                 let others = || {
-                    let responses = groups.clone().map(|group| response_port(&services, node, group, specification));
+                    let responses = groups.clone().map(|group| response_port(&services, node, group));
                     let responses: Vec<_> = responses.collect::<Result<_, _>>()?;
-                    let to_engine = ports::notifier(&services.events("to_engine", specification.groups)?)?;
-                    let to_trainer = ports::listener(&services.events("to_trainer", specification.groups)?)?;
+                    let to_engine = ports::notifier(&services.events("to_engine")?)?;
+                    let to_trainer = ports::listener(&services.events("to_trainer")?)?;
                     Ok((responses, to_engine, to_trainer))
                 };
                 // A dead trainer's ports are removed one by one, so these may still exist.
-                let (responses, to_engine, to_trainer) = create(&services, specification, others, || None)?;
+                let (responses, to_engine, to_trainer) = create(&services, others, || None)?;
                 Ok((requests, responses, to_engine, Doorbell::new(to_trainer)))
             })?;
         // A valid specification has at least one group.
@@ -80,15 +77,11 @@ impl EngineConnection {
 }
 
 /// The port that makes a process the trainer of a group.
-fn request_publisher(
-    services: &EngineServices<'_>,
-    group: usize,
-    specification: &ServiceSpecification,
-) -> Result<RequestPublisher, ServiceError> {
+fn request_publisher(services: &EngineServices<'_>, group: usize) -> Result<RequestPublisher, ServiceError> {
     let service = services.requests(group)?;
-    let (blocks, threads) = (specification.action.blocks(), Threads::new(1)?);
+    let (blocks, threads) = (services.specification.action.blocks(), Threads::new(1)?);
     let publisher = || ports::publisher(&service, blocks, REQUEST_CHUNKS, &threads).map(|(port, _)| port);
-    create(services, specification, publisher, || ports::publisher_node(&service))
+    create(services, publisher, || ports::publisher_node(&service))
 }
 
 /// The port that receives a group's responses.
@@ -96,9 +89,8 @@ fn response_port(
     services: &EngineServices<'_>,
     node: &Arc<NamespaceNode>,
     group: usize,
-    specification: &ServiceSpecification,
 ) -> Result<Arc<ResponsePort>, PortError> {
-    ResponsePort::open(services, node, group, specification).map(Arc::new).map_err(|e| match e {
+    ResponsePort::open(services, node, group).map(Arc::new).map_err(|e| match e {
         // Observers leave one place for the trainer.
         ServiceError::TooManyObservers { .. } => PortError::LimitReached,
         e => PortError::Other(e),
@@ -109,7 +101,6 @@ fn response_port(
 /// that has them, if known; if that node is running, it is another trainer.
 fn create<T>(
     services: &EngineServices<'_>,
-    specification: &ServiceSpecification,
     ports: impl Fn() -> Result<T, PortError>,
     owner: impl Fn() -> Option<UniqueNodeId>,
 ) -> Result<T, ServiceError> {
@@ -129,7 +120,7 @@ fn create<T>(
         let is_alive = owner.is_some_and(|owner| services.node.is_alive(owner));
         if is_alive || start.elapsed() >= REMOVAL_TIMEOUT {
             let pid = owner.and_then(|owner| services.node.process_id_of(owner));
-            return Err(ServiceError::TrainerExists { service: specification.service.clone(), pid });
+            return Err(ServiceError::TrainerExists { service: services.specification.service.clone(), pid });
         }
         services.node.remove_dead_nodes();
         std::thread::sleep(RETRY_INTERVAL);
@@ -161,11 +152,10 @@ mod tests {
         std::thread::scope(|scope| {
             scope.spawn(move || {
                 let node = Arc::new(NamespaceNode::join(root, Duration::ZERO).unwrap());
-                let names = ServiceNames::new(&specification.service, specification.incarnation);
-                let services = EngineServices { node: &node, names, mode: OpenMode::Open };
-                let responses = ResponsePort::open(&services, &node, 0, specification).unwrap();
-                let to_engine = ports::notifier(&services.events("to_engine", 1).unwrap()).unwrap();
-                let to_trainer = ports::listener(&services.events("to_trainer", 1).unwrap()).unwrap();
+                let services = EngineServices { node: &node, specification, mode: OpenMode::Open };
+                let responses = ResponsePort::open(&services, &node, 0).unwrap();
+                let to_engine = ports::notifier(&services.events("to_engine").unwrap()).unwrap();
+                let to_trainer = ports::listener(&services.events("to_trainer").unwrap()).unwrap();
                 to_main.send(()).unwrap();
                 end.recv().unwrap();
                 for rest in [Box::new(responses) as Box<dyn std::any::Any>, Box::new(to_engine), Box::new(to_trainer)] {

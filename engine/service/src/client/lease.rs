@@ -151,10 +151,9 @@ impl ResponseService {
         services: &EngineServices<'_>,
         node: &Arc<NamespaceNode>,
         group: usize,
-        specification: &ServiceSpecification,
     ) -> Result<Self, ServiceError> {
-        let service = services.responses(group, specification.lease_limits())?;
-        let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
+        let service = services.responses(group)?;
+        let restarted = || ServiceError::EngineRestarted { service: services.specification.service.clone() };
         let engine = ports::publisher_node(&service).ok_or_else(restarted)?;
         Ok(ResponseService { service: ForkGuard::new(service), group, engine, node: Arc::clone(node) })
     }
@@ -198,9 +197,8 @@ impl ResponsePort {
         services: &EngineServices<'_>,
         node: &Arc<NamespaceNode>,
         group: usize,
-        specification: &ServiceSpecification,
     ) -> Result<Self, ServiceError> {
-        ResponseService::open(services, node, group, specification)?.port(specification, false)
+        ResponseService::open(services, node, group)?.port(services.specification, false)
     }
 
     /// The engine's node.

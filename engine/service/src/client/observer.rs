@@ -17,7 +17,7 @@ use crate::error::ServiceError;
 use crate::namespace::iceoryx_files::data_segment;
 use crate::namespace::node::NamespaceNode;
 use crate::namespace::{descriptors, memory};
-use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
+use crate::protocol::ports::{self, EngineServices, OpenMode, chunk_blocks};
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, Bells, ObserverRecord, StatusFile, StatusReader, now};
 use crate::protocol::wait::LIVENESS_INTERVAL;
@@ -77,17 +77,17 @@ impl Observer {
     /// another process holds the namespace's lock for too long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn connect(config: &ConnectConfig, group: usize) -> Result<Self, ServiceError> {
         let (node, (port, service), specification) = connect_to_engine(config, |node, specification| {
-            let (service, groups) = (specification.service.clone(), specification.groups);
+            let groups = specification.groups;
             if group >= groups {
+                let service = specification.service.clone();
                 return Err(ServiceError::NoSuchGroup { service, given: group, groups });
             }
-            let names = ServiceNames::new(&service, specification.incarnation);
-            let services = EngineServices { node, names, mode: OpenMode::Open };
+            let services = EngineServices { node, specification, mode: OpenMode::Open };
             descriptors::reserve(descriptors::of_trainer(1) + STATUS_DESCRIPTORS)?;
             // One observer connects at a time, so that each counts those before it.
             let _lock = node.lock()?;
-            reserve_for_observer(&services, group, specification)?;
-            let service = ResponseService::open(&services, node, group, specification)?;
+            reserve_for_observer(&services, group)?;
+            let service = ResponseService::open(&services, node, group)?;
             Ok((service.port(specification, false)?, service))
         })?;
         let status = status_file::path(node.prefix(), &specification.service, specification.incarnation);
@@ -364,13 +364,9 @@ impl ObserverStatusWriter {
 
 /// Allocates memory for the batches that one more observer of a group may hold. The caller holds the namespace's lock,
 /// so that no other observer connects meanwhile.
-pub(crate) fn reserve_for_observer(
-    services: &EngineServices<'_>,
-    group: usize,
-    specification: &ServiceSpecification,
-) -> Result<(), ServiceError> {
-    let limits = specification.lease_limits();
-    let responses = services.responses(group, limits)?;
+pub(crate) fn reserve_for_observer(services: &EngineServices<'_>, group: usize) -> Result<(), ServiceError> {
+    let specification = services.specification;
+    let responses = services.responses(group)?;
     let trainer = services.requests(group).ok().and_then(|requests| ports::publisher_node(&requests));
     let mut ports = 0;
     responses.dynamic_config().list_subscribers(|subscriber| {
@@ -395,7 +391,7 @@ pub(crate) fn reserve_for_observer(
     let path = publisher.and_then(|publisher| data_segment(publisher, services.node.config())).ok_or_else(restarted)?;
     let segment = File::options().read(true).write(true).open(&path).map_err(|_| restarted())?;
 
-    let unused = limits.observer_chunks() * (specification.observers - observers);
+    let unused = specification.observer_chunks() * (specification.observers - observers);
     let chunk = (chunk_blocks(&specification.batch) * BLOCK_BYTES) as u64;
     let failed = ServiceError::file("cannot reserve shared memory", &path);
     let bytes = segment.metadata().map_err(&failed)?.len().saturating_sub(chunk * unused as u64).max(1);
@@ -404,9 +400,9 @@ pub(crate) fn reserve_for_observer(
     memory::check_free(bytes.saturating_sub(allocated).saturating_add(memory::MARGIN))?;
     match rustix::fs::fallocate(&segment, FallocateFlags::KEEP_SIZE, 0, bytes) {
         Ok(()) => Ok(()),
-        Err(Errno::NOSPC | Errno::NOMEM) => Err(memory::too_small(chunk * limits.observer_chunks() as u64)),
+        Err(Errno::NOSPC | Errno::NOMEM) => Err(memory::too_small(chunk * specification.observer_chunks() as u64)),
         // The file system cannot allocate in advance.
-        Err(Errno::OPNOTSUPP | Errno::NOSYS) => memory::check_free(chunk * limits.observer_chunks() as u64),
+        Err(Errno::OPNOTSUPP | Errno::NOSYS) => memory::check_free(chunk * specification.observer_chunks() as u64),
         Err(e) => Err(failed(e.into())),
     }
 }

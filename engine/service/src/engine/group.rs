@@ -18,7 +18,7 @@ use crate::error::{Rejection, ServiceError};
 use crate::namespace::directory::Ipc;
 use crate::namespace::memory::PrefaultedChunks;
 use crate::protocol::message::{PayloadBlock, RequestHeader, RequestKind, ResponseHeader, decode_reset, write_text};
-use crate::protocol::ports::{self, BlockService, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
+use crate::protocol::ports::{self, BlockService, EngineServices, RequestSubscriber, ResponsePublisher};
 use crate::protocol::wait::lock;
 
 /// A request in shared memory.
@@ -93,21 +93,16 @@ pub(crate) struct Group {
 }
 
 impl Group {
-    pub(crate) fn new(
-        services: &EngineServices<'_>,
-        number: usize,
-        pool: Pool,
-        limits: LeaseLimits,
-    ) -> Result<Self, ServiceError> {
+    pub(crate) fn new(services: &EngineServices<'_>, number: usize, pool: Pool) -> Result<Self, ServiceError> {
         let requests = services
             .requests(number)?
             .subscriber_builder()
             .create()
             .map_err(ServiceError::middleware("cannot create a subscriber"))?;
-        let service = services.responses(number, limits)?;
+        let service = services.responses(number)?;
         // An observer reserves its chunks when it connects.
         let blocks = ports::chunk_blocks(pool.layout());
-        let publisher = ports::publisher(&service, blocks, limits.trainer_chunks(), pool.threads());
+        let publisher = ports::publisher(&service, blocks, services.specification.trainer_chunks(), pool.threads());
         let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
         Ok(Group {
             pool,

@@ -22,7 +22,7 @@ use crate::namespace::memory::PrefaultedChunks;
 use crate::namespace::node::NamespaceNode;
 use crate::protocol::discovery;
 use crate::protocol::message::{RequestKind, ResponseHeader, copied};
-use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
+use crate::protocol::ports::{self, EngineServices, OpenMode, chunk_blocks};
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::wait::{Doorbell, lock};
 
@@ -216,22 +216,20 @@ impl Engine {
         let specification = specify(config, &pools[0])?;
         let head = CheckpointHead::new(config, &specification);
         let checkpointer = config.checkpoint.as_ref().map(|config| Checkpointer::new(config, head)).transpose()?;
-        let limits = specification.lease_limits();
         let blocks = chunk_blocks(&specification.batch);
-        PrefaultedChunks::check_available(blocks, limits.trainer_chunks() * config.groups)?;
-        let names = ServiceNames::new(&config.service, specification.incarnation);
-        let services = EngineServices { node: &node, names, mode: OpenMode::Create };
+        PrefaultedChunks::check_available(blocks, specification.trainer_chunks() * config.groups)?;
+        let services = EngineServices { node: &node, specification: &specification, mode: OpenMode::Create };
         let creating = node.creating()?;
-        let events = services.events("to_engine", config.groups)?;
+        let events = services.events("to_engine")?;
         let to_engine = Doorbell::new(ports::listener(&events).map_err(|e| e.unexpected("a listener"))?);
         let waker = (threads.len() > 1).then(|| ports::notifier(&events)).transpose();
         let waker = waker.map_err(|e| e.unexpected("a notifier"))?;
-        let to_trainer = ports::notifier(&services.events("to_trainer", config.groups)?);
+        let to_trainer = ports::notifier(&services.events("to_trainer")?);
         let to_trainer = to_trainer.map_err(|e| e.unexpected("a notifier"))?;
         let mut groups: Vec<_> = pools
             .into_iter()
             .enumerate()
-            .map(|(group, pool)| Group::new(&services, group, pool, limits))
+            .map(|(group, pool)| Group::new(&services, group, pool))
             .collect::<Result<_, _>>()?;
         let servers = threads.iter().enumerate().map(|(server, own)| Server {
             groups: first_group(config, threads, server)..first_group(config, threads, server + 1),
@@ -266,12 +264,12 @@ impl Engine {
         if found.is_none_or(|found| found.incarnation != *incarnation) {
             return Err(ServiceError::EngineUnreachable { service: service.clone() });
         }
-        let services = EngineServices { node, names: ServiceNames::new(service, *incarnation), mode: OpenMode::Open };
-        services.events("to_engine", *groups)?;
-        services.events("to_trainer", *groups)?;
+        let services = EngineServices { node, specification, mode: OpenMode::Open };
+        services.events("to_engine")?;
+        services.events("to_trainer")?;
         for group in 0..*groups {
             services.requests(group)?;
-            services.responses(group, specification.lease_limits())?;
+            services.responses(group)?;
         }
         Ok(())
     }
@@ -486,12 +484,10 @@ impl Engine {
     /// Removes the resources of a trainer that ends together with the engine: an engine often stops because its trainer
     /// was killed, and then no other process would clean up after it.
     fn remove_ending_trainer(&self) {
-        let ServiceSpecification { service, incarnation, groups, .. } = &self.specification;
-        let names = ServiceNames::new(service, *incarnation);
-        let services = EngineServices { node: &self.node, names, mode: OpenMode::Open };
+        let services = EngineServices { node: &self.node, specification: &self.specification, mode: OpenMode::Open };
         let has_trainer = |group| services.requests(group).is_ok_and(|port| ports::publisher_node(&port).is_some());
         let start = Instant::now();
-        while start.elapsed() < LAST_CLEANUP && (0..*groups).any(has_trainer) {
+        while start.elapsed() < LAST_CLEANUP && (0..self.specification.groups).any(has_trainer) {
             self.node.remove_dead_nodes();
             std::thread::sleep(Duration::from_millis(5));
         }

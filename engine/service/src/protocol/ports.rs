@@ -19,6 +19,7 @@ use crate::namespace::directory::Ipc;
 use crate::namespace::memory::PrefaultedChunks;
 use crate::namespace::node::NamespaceNode;
 use crate::protocol::message::{PayloadBlock, RequestHeader, ResponseHeader};
+use crate::protocol::specification::ServiceSpecification;
 
 pub(crate) type BlockService<H> = publish_subscribe::PortFactory<Ipc, [PayloadBlock], H>;
 pub(crate) type BlockPublisher<H> = Publisher<Ipc, [PayloadBlock], H>;
@@ -30,49 +31,11 @@ pub(crate) type ResponseSubscriber = Subscriber<Ipc, [PayloadBlock], ResponseHea
 /// Nodes that may open a service at a time: the engine, its trainer, observers, and processes that are about to be refused.
 const MAX_NODES: usize = 64;
 
-/// Names of one engine's services. They contain the incarnation, so that a restarted engine shares no service with a
-/// dead one.
-#[derive(Clone, Debug)]
-pub(crate) struct ServiceNames {
-    service: String,
-    incarnation: u64,
-}
-
 /// Name of the port of an observer that resumed after a pause. Other ports have no name.
 pub(crate) const RESUMED: &str = "resumed";
 
 /// Prefix of the names of all services.
 pub(crate) const SERVICE_PREFIX: &str = "endless-gym/";
-
-impl ServiceNames {
-    pub(crate) fn new(service: &str, incarnation: u64) -> Self {
-        ServiceNames { service: service.to_owned(), incarnation }
-    }
-
-    fn of_incarnation(&self, what: &str) -> Result<ServiceName, ServiceError> {
-        let text = format!("{SERVICE_PREFIX}{}/{:016x}/{what}", self.service, self.incarnation);
-        ServiceName::new(&text).map_err(ServiceError::middleware("cannot create a service name"))
-    }
-}
-
-/// How many batches of a group its trainer and observers may hold. This determines the number of chunks in shared memory.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct LeaseLimits {
-    pub batches_held: usize,
-    pub observers: usize,
-}
-
-impl LeaseLimits {
-    /// Chunks in use without observers: those that the trainer holds, one in its queue and one being written.
-    pub(crate) fn trainer_chunks(self) -> usize {
-        self.batches_held + 2
-    }
-
-    /// Chunks in use by one observer: those that it holds, and one in its queue.
-    pub(crate) fn observer_chunks(self) -> usize {
-        self.batches_held + 1
-    }
-}
 
 /// Blocks of a chunk that can hold a batch or a snapshot.
 pub(crate) fn chunk_blocks(batch: &Layout) -> usize {
@@ -89,23 +52,27 @@ pub(crate) enum OpenMode {
 /// Creates or opens the services of one engine.
 pub(crate) struct EngineServices<'a> {
     pub node: &'a NamespaceNode,
-    pub names: ServiceNames,
+    pub specification: &'a ServiceSpecification,
     pub mode: OpenMode,
 }
 
 impl EngineServices<'_> {
+    /// The name of a service. It contains the incarnation, so that a restarted engine shares no service with a dead one.
+    fn name(&self, what: &str) -> Result<ServiceName, ServiceError> {
+        let ServiceSpecification { service, incarnation, .. } = self.specification;
+        let text = format!("{SERVICE_PREFIX}{service}/{incarnation:016x}/{what}");
+        ServiceName::new(&text).map_err(ServiceError::middleware("cannot create a service name"))
+    }
+
     /// The service of one group's requests: from one trainer to one engine.
     pub(crate) fn requests(&self, group: usize) -> Result<BlockService<RequestHeader>, ServiceError> {
         self.block_service(&format!("act/{group}"), 1, 1)
     }
 
     /// The service of one group's responses: from one engine to its trainer and observers.
-    pub(crate) fn responses(
-        &self,
-        group: usize,
-        limits: LeaseLimits,
-    ) -> Result<BlockService<ResponseHeader>, ServiceError> {
-        self.block_service(&format!("obs/{group}"), limits.batches_held, 1 + limits.observers)
+    pub(crate) fn responses(&self, group: usize) -> Result<BlockService<ResponseHeader>, ServiceError> {
+        let ServiceSpecification { batches_held, observers, .. } = *self.specification;
+        self.block_service(&format!("obs/{group}"), batches_held, 1 + observers)
     }
 
     /// A service with one publisher and `subscribers` subscribers, each of which may borrow `borrowed` samples.
@@ -117,7 +84,7 @@ impl EngineServices<'_> {
     ) -> Result<BlockService<H>, ServiceError> {
         let builder = self
             .node
-            .service_builder(&self.names.of_incarnation(name)?)
+            .service_builder(&self.name(name)?)
             .publish_subscribe::<[PayloadBlock]>()
             .user_header::<H>()
             .enable_safe_overflow(true)
@@ -133,13 +100,13 @@ impl EngineServices<'_> {
         }
     }
 
-    /// The events of one direction. The id of an event is the number of a group, or `groups`, the number of groups, for any.
-    pub(crate) fn events(&self, to: &str, groups: usize) -> Result<event::PortFactory<Ipc>, ServiceError> {
+    /// The events of one direction. The id of an event is the number of a group, or the number of groups for any.
+    pub(crate) fn events(&self, to: &str) -> Result<event::PortFactory<Ipc>, ServiceError> {
         let builder = self
             .node
-            .service_builder(&self.names.of_incarnation(to)?)
+            .service_builder(&self.name(to)?)
             .event()
-            .event_id_max_value(groups)
+            .event_id_max_value(self.specification.groups)
             .max_listeners(1)
             // The other side's; and the engine's, which wakes its own threads.
             .max_notifiers(2)
@@ -151,7 +118,7 @@ impl EngineServices<'_> {
     }
 
     fn open_error(&self, failure: OpenFailure) -> ServiceError {
-        let service = self.names.service.clone();
+        let service = self.specification.service.clone();
         match failure {
             OpenFailure::Missing => ServiceError::EngineRestarted { service },
             OpenFailure::OtherType => ServiceError::IncompatibleTypes { service },

@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
 
 use crate::protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
-use crate::protocol::ports::LeaseLimits;
 
 /// Describes an engine and its environments. The engine publishes it as JSON under its name.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -73,8 +72,15 @@ impl ServiceSpecification {
         ["frame", "picture"].into_iter().find_map(|name| FrameShape::deserialize(&self.environment[name]).ok())
     }
 
-    pub(crate) fn lease_limits(&self) -> LeaseLimits {
-        LeaseLimits { batches_held: self.batches_held, observers: self.observers }
+    /// Chunks of shared memory that a group uses without observers: those that the trainer holds, one in its queue and one
+    /// being written.
+    pub(crate) fn trainer_chunks(&self) -> usize {
+        self.batches_held + 2
+    }
+
+    /// Chunks that one observer uses: those that it holds, and one in its queue.
+    pub(crate) fn observer_chunks(&self) -> usize {
+        self.batches_held + 1
     }
 
     /// Checks the fields on which a trainer of the engine `service` relies. Returns the reason if one is invalid.

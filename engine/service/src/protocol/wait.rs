@@ -184,14 +184,14 @@ mod tests {
     use super::*;
     use crate::namespace::directory::Namespace;
     use crate::namespace::node::NamespaceNode;
-    use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames};
+    use crate::protocol::ports;
 
     #[test]
     fn a_timeout_below_a_microsecond_does_not_block_forever() {
         let root = format!("/tmp/endless-wait-{}", std::process::id());
         let node = NamespaceNode::join(&Namespace::at(&root), Duration::ZERO).unwrap();
-        let services = EngineServices { node: &node, names: ServiceNames::new("wait", 1), mode: OpenMode::Create };
-        let doorbell = Doorbell::new(ports::listener(&services.events("to_engine", 1).unwrap()).unwrap());
+        let service = node.service_builder(&"wait".try_into().unwrap()).event().create().unwrap();
+        let doorbell = Doorbell::new(ports::listener(&service).unwrap());
         for timeout in [Duration::from_nanos(1), Duration::ZERO] {
             assert!(doorbell.park(&(0..1), timeout, &mut || Ok(false)).unwrap());
         }
@@ -205,8 +205,8 @@ mod tests {
     fn each_thread_wakes_for_its_own_group_and_another_leads_when_the_leader_leaves() {
         let root = format!("/tmp/endless-bell-{}", std::process::id());
         let node = NamespaceNode::join(&Namespace::at(&root), Duration::ZERO).unwrap();
-        let services = EngineServices { node: &node, names: ServiceNames::new("bell", 1), mode: OpenMode::Create };
-        let events = services.events("to_engine", 3).unwrap();
+        let builder = node.service_builder(&"bell".try_into().unwrap()).event().event_id_max_value(3);
+        let events = builder.create().unwrap();
         let doorbell = Doorbell::new(ports::listener(&events).unwrap());
         let notifier = ports::notifier(&events).unwrap();
         let (long, past) = (Duration::from_secs(30), Instant::now() - YIELD);
