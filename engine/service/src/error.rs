@@ -294,12 +294,6 @@ impl ServiceError {
             }
         }
     }
-
-    /// The error for an engine that was built with another version of iceoryx2.
-    pub(crate) fn other_iceoryx2(service: &str) -> Self {
-        let package = "with another version of iceoryx2".to_owned();
-        ServiceError::Version { service: service.to_owned(), layout: "unknown".to_owned(), package }
-    }
 }
 
 /// Why an engine rejected a request. Except for [`Rejection::Panic`], no environment has changed.

@@ -81,7 +81,7 @@ fn request_publisher(services: &EngineServices<'_>, group: usize) -> Result<Requ
     let service = services.requests(group)?;
     let (blocks, threads) = (services.specification.action.blocks(), Threads::new(1)?);
     let publisher = || ports::publisher(&service, blocks, REQUEST_CHUNKS, &threads).map(|(port, _)| port);
-    create(services, publisher, || ports::publisher_node(&service))
+    create(services, publisher, || ports::publisher_of(&service).map(|publisher| publisher.node_id))
 }
 
 /// The port that receives a group's responses.

@@ -154,7 +154,7 @@ impl ResponseService {
     ) -> Result<Self, ServiceError> {
         let service = services.responses(group)?;
         let restarted = || ServiceError::EngineRestarted { service: services.specification.service.clone() };
-        let engine = ports::publisher_node(&service).ok_or_else(restarted)?;
+        let engine = ports::publisher_of(&service).ok_or_else(restarted)?.node_id;
         Ok(ResponseService { service: ForkGuard::new(service), group, engine, node: Arc::clone(node) })
     }
 

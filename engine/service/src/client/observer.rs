@@ -367,7 +367,8 @@ impl ObserverStatusWriter {
 pub(crate) fn reserve_for_observer(services: &EngineServices<'_>, group: usize) -> Result<(), ServiceError> {
     let specification = services.specification;
     let responses = services.responses(group)?;
-    let trainer = services.requests(group).ok().and_then(|requests| ports::publisher_node(&requests));
+    let trainer = services.requests(group).ok().and_then(|requests| ports::publisher_of(&requests));
+    let trainer = trainer.map(|trainer| trainer.node_id);
     let mut ports = 0;
     responses.dynamic_config().list_subscribers(|subscriber| {
         ports += usize::from(Some(subscriber.node_id) != trainer);
@@ -382,13 +383,9 @@ pub(crate) fn reserve_for_observer(services: &EngineServices<'_>, group: usize) 
         let (service, limit) = (specification.service.clone(), specification.observers);
         return Err(ServiceError::TooManyObservers { service, limit });
     }
-    let mut publisher = None;
-    responses.dynamic_config().list_publishers(|details| {
-        publisher = Some(details.publisher_id.value());
-        CallbackProgression::Stop
-    });
     let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
-    let path = publisher.and_then(|publisher| data_segment(publisher, services.node.config())).ok_or_else(restarted)?;
+    let publisher = ports::publisher_of(&responses).ok_or_else(restarted)?.publisher_id.value();
+    let path = data_segment(publisher, services.node.config()).ok_or_else(restarted)?;
     let segment = File::options().read(true).write(true).open(&path).map_err(|_| restarted())?;
 
     let unused = specification.observer_chunks() * (specification.observers - observers);

@@ -102,8 +102,8 @@ impl Group {
         let service = services.responses(number)?;
         // An observer reserves its chunks when it connects.
         let blocks = ports::chunk_blocks(pool.layout());
-        let publisher = ports::publisher(&service, blocks, services.specification.trainer_chunks(), pool.threads());
-        let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
+        let (responses, memory) =
+            ports::publisher(&service, blocks, services.specification.trainer_chunks(), pool.threads())?;
         Ok(Group {
             pool,
             requests: Arc::new(requests),

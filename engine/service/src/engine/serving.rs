@@ -221,11 +221,9 @@ impl Engine {
         let services = EngineServices { node: &node, specification: &specification, mode: OpenMode::Create };
         let creating = node.creating()?;
         let events = services.events("to_engine")?;
-        let to_engine = Doorbell::new(ports::listener(&events).map_err(|e| e.unexpected("a listener"))?);
-        let waker = (threads.len() > 1).then(|| ports::notifier(&events)).transpose();
-        let waker = waker.map_err(|e| e.unexpected("a notifier"))?;
-        let to_trainer = ports::notifier(&services.events("to_trainer")?);
-        let to_trainer = to_trainer.map_err(|e| e.unexpected("a notifier"))?;
+        let to_engine = Doorbell::new(ports::listener(&events)?);
+        let waker = (threads.len() > 1).then(|| ports::notifier(&events)).transpose()?;
+        let to_trainer = ports::notifier(&services.events("to_trainer")?)?;
         let mut groups: Vec<_> = pools
             .into_iter()
             .enumerate()
@@ -485,7 +483,7 @@ impl Engine {
     /// was killed, and then no other process would clean up after it.
     fn remove_ending_trainer(&self) {
         let services = EngineServices { node: &self.node, specification: &self.specification, mode: OpenMode::Open };
-        let has_trainer = |group| services.requests(group).is_ok_and(|port| ports::publisher_node(&port).is_some());
+        let has_trainer = |group| services.requests(group).is_ok_and(|port| ports::publisher_of(&port).is_some());
         let start = Instant::now();
         while start.elapsed() < LAST_CLEANUP && (0..self.specification.groups).any(has_trainer) {
             self.node.remove_dead_nodes();

@@ -2,7 +2,6 @@
 
 use endless_gym_core::batch::{Layout, SNAPSHOT_BYTES, blocks_for};
 use endless_gym_core::pool::Threads;
-use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::listener::{Listener, ListenerCreateError};
 use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
@@ -12,6 +11,7 @@ use iceoryx2::prelude::{
 };
 use iceoryx2::service::builder::event::EventOpenError;
 use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
+use iceoryx2::service::dynamic_config::publish_subscribe::PublisherDetails;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 use crate::error::ServiceError;
@@ -96,7 +96,7 @@ impl EngineServices<'_> {
             .max_nodes(MAX_NODES);
         match self.mode {
             OpenMode::Create => builder.create().map_err(ServiceError::middleware("cannot create a service")),
-            OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
+            OpenMode::Open => builder.open().map_err(|e| block_error(&self.specification.service, e)),
         }
     }
 
@@ -113,54 +113,36 @@ impl EngineServices<'_> {
             .max_nodes(MAX_NODES);
         match self.mode {
             OpenMode::Create => builder.create().map_err(ServiceError::middleware("cannot create a service")),
-            OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
-        }
-    }
-
-    fn open_error(&self, failure: OpenFailure) -> ServiceError {
-        let service = self.specification.service.clone();
-        match failure {
-            OpenFailure::Missing => ServiceError::EngineRestarted { service },
-            OpenFailure::OtherType => ServiceError::IncompatibleTypes { service },
-            OpenFailure::OtherVersion => ServiceError::other_iceoryx2(&service),
-            OpenFailure::Other(reason) => ServiceError::middleware("cannot open a service")(reason),
+            OpenMode::Open => builder.open().map_err(|e| event_error(&self.specification.service, e)),
         }
     }
 }
 
-/// Why a service could not be opened.
-#[derive(Debug, PartialEq, Eq)]
-enum OpenFailure {
-    /// It does not exist, or it is being removed.
-    Missing,
-    /// Its messages have another type.
-    OtherType,
-    /// It was created by another version of iceoryx2.
-    OtherVersion,
-    Other(String),
-}
-
-/// Classifies the errors of opening a service; `other_type` are the variants for messages of another type.
-macro_rules! open_failure {
-    ($error:ident, $($other_type:ident)|+) => {
-        impl From<$error> for OpenFailure {
-            fn from(error: $error) -> Self {
-                use $error as E;
-                match error {
-                    E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
-                        OpenFailure::Missing
-                    }
-                    $(E::$other_type)|+ => OpenFailure::OtherType,
-                    E::VersionMismatch => OpenFailure::OtherVersion,
-                    e => OpenFailure::Other(e.to_string()),
+/// Defines `function`, which converts an error of opening a service of the engine `service`; `other_type` are the variants for
+/// messages of another type.
+macro_rules! open_error {
+    ($function:ident, $error:ident, $($other_type:ident)|+) => {
+        fn $function(service: &str, error: $error) -> ServiceError {
+            use $error as E;
+            let service = service.to_owned();
+            match error {
+                // It does not exist, or it is being removed.
+                E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
+                    ServiceError::EngineRestarted { service }
                 }
+                $(E::$other_type)|+ => ServiceError::IncompatibleTypes { service },
+                E::VersionMismatch => {
+                    let package = "with another version of iceoryx2".to_owned();
+                    ServiceError::Version { service, layout: "unknown".to_owned(), package }
+                }
+                e => ServiceError::middleware("cannot open a service")(e),
             }
         }
     };
 }
 
-open_failure!(PublishSubscribeOpenError, IncompatibleTypes | IncompatibleMessagingPattern);
-open_failure!(EventOpenError, IncompatibleMessagingPattern);
+open_error!(block_error, PublishSubscribeOpenError, IncompatibleTypes | IncompatibleMessagingPattern);
+open_error!(event_error, EventOpenError, IncompatibleMessagingPattern);
 
 /// A publisher of messages of `blocks` blocks. Prefaults `prefaulted` chunks by `threads`, so that missing memory is an error here and
 /// not a SIGBUS later.
@@ -225,14 +207,12 @@ port_error!(PublisherCreateError, ExceedsMaxSupportedPublishers, "cannot create 
 port_error!(NotifierCreateError, ExceedsMaxSupportedNotifiers, "cannot create a notifier");
 port_error!(ListenerCreateError, ExceedsMaxSupportedListeners, "cannot create a listener");
 
-impl PortError {
-    /// Turns it into a service error where no other process can have such a port.
-    pub(crate) fn unexpected(self, port: &str) -> ServiceError {
-        match self {
+/// For ports that no other process can have.
+impl From<PortError> for ServiceError {
+    fn from(error: PortError) -> Self {
+        match error {
             PortError::Other(e) => e,
-            PortError::LimitReached => {
-                ServiceError::middleware("cannot create a port")(format!("{port} exists already"))
-            }
+            PortError::LimitReached => ServiceError::middleware("cannot create a port")("it exists already"),
         }
     }
 }
@@ -254,23 +234,14 @@ pub(crate) fn notify(notifier: &Notifier<Ipc>, group: usize) {
     }
 }
 
-/// The first node that `list` reports.
-pub(crate) fn first_node(list: impl FnOnce(&mut dyn FnMut(UniqueNodeId))) -> Option<UniqueNodeId> {
-    let mut first = None;
-    list(&mut |node| {
-        first.get_or_insert(node);
+/// The publisher of a service.
+pub(crate) fn publisher_of<H: std::fmt::Debug + ZeroCopySend>(service: &BlockService<H>) -> Option<PublisherDetails> {
+    let mut publisher = None;
+    service.dynamic_config().list_publishers(|details| {
+        publisher = Some(*details);
+        CallbackProgression::Stop
     });
-    first
-}
-
-/// The node that publishes on a service.
-pub(crate) fn publisher_node<H: std::fmt::Debug + ZeroCopySend>(service: &BlockService<H>) -> Option<UniqueNodeId> {
-    first_node(|found| {
-        service.dynamic_config().list_publishers(|details| {
-            found(details.node_id);
-            CallbackProgression::Continue
-        });
-    })
+    publisher
 }
 
 #[cfg(test)]
@@ -280,11 +251,13 @@ mod tests {
     #[test]
     fn open_errors_are_told_apart_by_their_variant() {
         use PublishSubscribeOpenError as E;
-        assert_eq!(OpenFailure::from(E::IncompatibleTypes), OpenFailure::OtherType);
-        assert_eq!(OpenFailure::from(E::VersionMismatch), OpenFailure::OtherVersion);
-        assert_eq!(OpenFailure::from(E::HangsInCreation), OpenFailure::Missing);
-        assert!(matches!(OpenFailure::from(E::ExceedsMaxNumberOfNodes), OpenFailure::Other(_)));
-        assert_eq!(OpenFailure::from(EventOpenError::IncompatibleMessagingPattern), OpenFailure::OtherType);
-        assert_eq!(OpenFailure::from(EventOpenError::VersionMismatch), OpenFailure::OtherVersion);
+        let of = |error| block_error("gym", error);
+        assert!(matches!(of(E::IncompatibleTypes), ServiceError::IncompatibleTypes { .. }));
+        assert!(matches!(of(E::VersionMismatch), ServiceError::Version { .. }));
+        assert!(matches!(of(E::HangsInCreation), ServiceError::EngineRestarted { .. }));
+        assert!(matches!(of(E::ExceedsMaxNumberOfNodes), ServiceError::Middleware { .. }));
+        let of = |error| event_error("gym", error);
+        assert!(matches!(of(EventOpenError::IncompatibleMessagingPattern), ServiceError::IncompatibleTypes { .. }));
+        assert!(matches!(of(EventOpenError::VersionMismatch), ServiceError::Version { .. }));
     }
 }
