@@ -443,7 +443,8 @@ impl RequestData {
             return Err((Rejection::Version, text));
         }
         let Some(kind) = RequestKind::from_code(header.kind) else {
-            let text = format!("request kind must be 1 to {}, got {}", RequestKind::ALL.len(), header.kind);
+            let highest = (1..).map_while(RequestKind::from_code).count();
+            let text = format!("request kind must be 1 to {highest}, got {}", header.kind);
             return Err((Rejection::Kind, text));
         };
         if payload.len() < layout.blocks() {

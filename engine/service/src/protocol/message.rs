@@ -3,7 +3,7 @@
 //! A sender can change a header in shared memory at any time. A receiver must copy it once with [`copied`], check the
 //! copy, and use only the copy.
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::{CheckedBitPattern, Pod, Zeroable};
 use endless_gym_core::batch::{Block, LAYOUT_VERSION};
 use endless_gym_core::pool::EnvReset;
 use endless_gym_core::printable;
@@ -30,11 +30,12 @@ pub(crate) fn copied<H: Copy>(header: &H) -> H {
     unsafe { std::ptr::read_volatile(header) }
 }
 
-/// What a trainer requests.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// What a trainer requests. 0 is not a kind.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, CheckedBitPattern)]
+#[repr(u32)]
 pub(crate) enum RequestKind {
     /// Step all environments with the payload's `action`.
-    Step,
+    Step = 1,
     /// Start an episode in every environment, seeded by the pool's seeding.
     ResetAll,
     /// Start an episode in every environment; environment `i` of the engine is seeded with the header's `seed + i`.
@@ -54,21 +55,9 @@ pub(crate) enum RequestKind {
 }
 
 impl RequestKind {
-    pub(crate) const ALL: [RequestKind; 9] = [
-        RequestKind::Step,
-        RequestKind::ResetAll,
-        RequestKind::ResetSeed,
-        RequestKind::ResetEach,
-        RequestKind::Snapshot,
-        RequestKind::Restore,
-        RequestKind::Checkpoint,
-        RequestKind::SetOptions,
-        RequestKind::Episodes,
-    ];
-
-    /// The code in the header. 0 is not a code.
+    /// The code in the header.
     pub(crate) fn code(self) -> u32 {
-        self as u32 + 1
+        self as u32
     }
 
     /// A word for the kind, for people.
@@ -86,7 +75,7 @@ impl RequestKind {
 
     /// The kind with that code.
     pub(crate) fn from_code(code: u32) -> Option<Self> {
-        RequestKind::ALL.into_iter().find(|kind| kind.code() == code)
+        bytemuck::checked::try_cast(code).ok()
     }
 
     /// Whether the response holds a batch and not a snapshot or text.
