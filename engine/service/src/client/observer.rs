@@ -358,7 +358,7 @@ impl ObserverStatusWriter {
     pub(crate) fn received(&mut self, held: usize) {
         let ObserverRecord { batches, .. } = self.record;
         self.record = ObserverRecord { batches: batches + 1, last_batch: now(), held: held as u32, ..self.record };
-        self.file.write_observer(&self.record);
+        self.file.write_first(&self.record);
     }
 }
 

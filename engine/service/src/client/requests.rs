@@ -25,8 +25,8 @@ impl Request {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PendingRequest {
     /// Its number and content.
-    pending: Option<(u64, Request)>,
-    last: LastRequest,
+    pub pending: Option<(u64, Request)>,
+    pub last: LastRequest,
 }
 
 impl PendingRequest {
@@ -48,19 +48,9 @@ impl PendingRequest {
         self.pending.is_some_and(|(_, pending)| pending == request)
     }
 
-    /// The number of the pending request.
-    pub(crate) fn any_number(&self) -> Option<u64> {
-        self.pending.map(|(number, _)| number)
-    }
-
     /// The number of the pending request, if it returns a batch (`batch`) or does not (`!batch`).
     pub(crate) fn number(&self, batch: bool) -> Option<u64> {
         self.pending.filter(|(_, pending)| pending.kind.returns_batch() == batch).map(|(number, _)| number)
-    }
-
-    /// What became of the last request.
-    pub(crate) fn last(&self) -> LastRequest {
-        self.last
     }
 
     /// Whether a request that returns a batch is pending.

@@ -140,7 +140,7 @@ impl Trainer {
         }
         let lost = Arc::clone(self.shared());
         let restarted = !lost.connection.is_engine_alive();
-        let mut last: Vec<_> = self.groups.iter().map(|group| (None, group.pending.last())).collect();
+        let mut last: Vec<_> = self.groups.iter().map(|group| (None, group.pending.last)).collect();
         if restarted {
             let config = lost.config.clone().timeout(timeout);
             let (connection, specification) = EngineConnection::open(&config)?;
@@ -150,7 +150,7 @@ impl Trainer {
             for (group, (lost_step, last)) in self.groups.iter().zip(&mut last) {
                 let status = lost.connection.status.as_ref().and_then(|status| status.group(group.number));
                 *lost_step = status.map(|status| status.step);
-                if let Some(number) = group.pending.any_number() {
+                if let Some((number, _)) = group.pending.pending {
                     *last = LastRequest::of_dead_engine(status, lost.id, number);
                 }
             }

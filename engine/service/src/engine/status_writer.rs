@@ -60,7 +60,7 @@ impl StatusWriter {
     pub(crate) fn update_engine(&self, change: impl FnOnce(&mut EngineRecord)) {
         let mut record = lock(&self.engine);
         change(&mut record);
-        self.file.write_engine(&record);
+        self.file.write_first(&*record);
     }
 
     /// Changes a group's record.

@@ -157,11 +157,8 @@ impl StatusFile {
         Ok(status)
     }
 
-    pub(crate) fn write_engine(&self, record: &EngineRecord) {
-        self.write(0, record);
-    }
-
-    pub(crate) fn write_observer(&self, record: &ObserverRecord) {
+    /// Writes the first record, that of the engine or the observer.
+    pub(crate) fn write_first(&self, record: &impl Pod) {
         self.write(0, record);
     }
 
