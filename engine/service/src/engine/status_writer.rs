@@ -123,15 +123,10 @@ impl StatusWriter {
     /// Totals over the groups.
     pub(crate) fn summary(&self) -> EngineSummary {
         let sum = |field: fn(&GroupRecord) -> u64| self.groups.iter().map(|group| field(&lock(group))).sum();
-        let engine = lock(&self.engine);
         EngineSummary {
             batches: sum(|group| group.batches),
             env_steps: sum(|group| group.env_steps),
-            episodes: sum(|group| group.episodes),
             rejected: sum(|group| group.rejected),
-            undelivered: sum(|group| group.undelivered),
-            dropped: engine.dropped,
-            recoveries: engine.recoveries,
         }
     }
 }
@@ -143,14 +138,6 @@ pub struct EngineSummary {
     pub batches: u64,
     /// Steps, summed over the environments.
     pub env_steps: u64,
-    /// Episodes that have ended.
-    pub episodes: u64,
     /// Requests that were rejected.
     pub rejected: u64,
-    /// Requests for an earlier incarnation, which were ignored.
-    pub dropped: u64,
-    /// Batches that no process received.
-    pub undelivered: u64,
-    /// Dead processes whose resources the engine removed.
-    pub recoveries: u64,
 }
