@@ -382,7 +382,8 @@ pub(crate) struct EngineHead {
     pub specification_bytes: u64,
 }
 
-/// The status of the whole engine. Times are in nanoseconds of CLOCK_MONOTONIC, 0 for none.
+/// The status of the whole engine, with fields as in [`EngineStatus`](crate::EngineStatus). Times are in nanoseconds of
+/// CLOCK_MONOTONIC, 0 for none.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct EngineRecord {
@@ -391,11 +392,8 @@ pub(crate) struct EngineRecord {
     pub started: u64,
     pub groups: u32,
     pub num_envs: u32,
-    /// Requests for an earlier incarnation, which were ignored.
     pub dropped: u64,
-    /// Dead processes whose resources the engine removed.
     pub recoveries: u64,
-    /// Checkpoints saved, and the time of the last one.
     pub checkpoints: u64,
     pub last_checkpoint: u64,
     /// Environment id and engine name, padded with zeros.
@@ -411,13 +409,12 @@ impl EngineRecord {
     }
 }
 
-/// The status of one group. Times are as in [`EngineRecord`].
+/// The status of one group, with fields as in [`GroupStatus`](crate::GroupStatus). Times are as in [`EngineRecord`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct GroupRecord {
-    /// Batches returned, as in the header of a response.
     pub step: u64,
-    /// The trainer of the last request, and how many trainers there were.
+    /// The random number of the trainer of the last request.
     pub trainer: u64,
     pub trainers: u64,
     /// Numbers of that trainer's requests: the last one that was taken, answered, and executed rather than rejected.
@@ -435,12 +432,10 @@ pub(crate) struct GroupRecord {
     pub undelivered: u64,
     /// Code of the last request's [`RequestKind`].
     pub kind: u32,
-    /// Process id of the trainer, as reported by it.
+    /// As reported by the trainer.
     pub trainer_process: u32,
-    /// Batches that the trainer held when it sent the last request.
     pub held: u32,
     pub padding: u32,
-    /// Sums over the episodes that have ended, and how many of them succeeded.
     pub returns: f64,
     pub lengths: u64,
     pub successes: u64,
@@ -453,18 +448,15 @@ impl GroupRecord {
     }
 }
 
-/// The status of one observer. Times are as in [`EngineRecord`].
+/// The status of one observer, with fields as in [`ObserverStatus`](crate::ObserverStatus). Times are as in [`EngineRecord`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct ObserverRecord {
-    /// Process id, as reported by the observer.
+    /// As reported by the observer.
     pub process: u32,
     pub group: u32,
-    /// Batches received.
     pub batches: u64,
-    /// When it received the last one.
     pub last_batch: u64,
-    /// Batches that it held then, including that one.
     pub held: u32,
     pub padding: u32,
 }
