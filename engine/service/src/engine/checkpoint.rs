@@ -430,14 +430,6 @@ mod tests {
         (head, bytes)
     }
 
-    #[test]
-    fn every_truncation_is_an_error() {
-        let (head, bytes) = checkpoint("short");
-        for length in 0..bytes.len() {
-            decode(Path::new("file"), &bytes[..length], &head).unwrap_err();
-        }
-    }
-
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(40))]
 
@@ -485,7 +477,9 @@ mod tests {
         let (head, bytes) = checkpoint("foreign");
         let message =
             |bytes: &[u8], head: &CheckpointHead| decode(Path::new("/a/b"), bytes, head).unwrap_err().to_string();
-        assert_eq!(message(b"PK\x03\x04 something else", &head), "/a/b is not a checkpoint of an engine");
+        for foreign in [&b"PK\x03\x04 something else"[..], b"EGYC"] {
+            assert_eq!(message(foreign, &head), "/a/b is not a checkpoint of an engine");
+        }
         let mut newer = bytes.clone();
         newer[4] = 9;
         assert!(message(&newer, &head).contains("must be of version 1, got version 9"));
@@ -496,14 +490,6 @@ mod tests {
         assert_eq!(message(&bytes, &other), "checkpoint /a/b was saved with num_envs 2, and the engine has 5");
         let newer_package = CheckpointHead { package: "99.0.0".to_owned(), ..head };
         decode(Path::new("file"), &bytes, &newer_package).unwrap();
-    }
-
-    #[test]
-    fn an_unwritable_path_is_an_error_before_the_first_checkpoint() {
-        for (path, part) in [("/nowhere/file", "No such file"), ("/dev", "directory")] {
-            let text = check_writable(Path::new(path)).unwrap_err().to_string();
-            assert!(text.contains(path) && text.contains(part), "{text}");
-        }
     }
 
     #[test]
