@@ -19,7 +19,7 @@ use crate::support::process::{Process, TIMEOUT, inside_namespace, unshare, wait_
 use crate::support::service::{ID, assert_error, play, reset, step};
 use endless_gym::memory_gym;
 use endless_gym::pool::ResetRequest;
-use endless_gym::service::{Engine, LockHolder, Namespace, Observer, ServiceError, running_engines};
+use endless_gym::service::{Engine, LockHolder, Observer, ServiceError, running_engines};
 use rustix::process::Signal;
 
 const SEGMENTS: &str = "/dev/shm";
@@ -339,12 +339,6 @@ fn limits_of_memory_and_files_are_named_and_nothing_is_left() {
             place.assert_nothing_left();
         }
     }
-}
-
-#[test]
-fn a_shared_directory_is_refused_without_advising_chmod() {
-    let error = running_engines(&Namespace::at("/tmp")).unwrap_err().to_string();
-    assert!(error.contains("shared with other users") && !error.contains("chmod"), "{error}");
 }
 
 #[test]

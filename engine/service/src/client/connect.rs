@@ -110,23 +110,3 @@ fn find(node: &NamespaceNode, config: &ConnectConfig) -> Result<ServiceSpecifica
     }
     Err(ServiceError::UnknownEngine { service, root: config.namespace.root().to_owned(), running })
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_negative_and_non_finite_timeouts_are_errors() {
-        for given in [-0.001, f64::NAN, f64::INFINITY] {
-            assert!(matches!(timeout_from_seconds(given), Err(ServiceError::InvalidTimeout { .. })), "{given}");
-        }
-        for (given, expected) in [
-            (-0.0, Duration::ZERO),
-            (1.5, Duration::from_millis(1500)),
-            (1e19, Duration::from_secs(10_000_000_000_000_000_000)),
-            (f64::MAX, Duration::MAX),
-        ] {
-            assert_eq!(timeout_from_seconds(given).unwrap(), expected);
-        }
-    }
-}
