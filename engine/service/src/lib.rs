@@ -6,15 +6,8 @@
 //!
 //! # Services
 //!
-//! | iceoryx2 service | messaging pattern | direction | content |
-//! | --- | --- | --- | --- |
-//! | `endless-gym/NAME/INCARNATION/act/GROUP` | publish/subscribe | trainer → engine | requests |
-//! | `endless-gym/NAME/INCARNATION/obs/GROUP` | publish/subscribe | engine → trainer, observers | responses |
-//! | `endless-gym/NAME/INCARNATION/to_engine` | event | trainer → engine | number of a group with a request; the engine wakes its own threads by it, too |
-//! | `endless-gym/NAME/INCARNATION/to_trainer` | event | engine → trainer | number of a group with a response |
-//!
-//! The incarnation is a random number drawn when an engine starts, so that it shares no service with a dead predecessor
-//! of the same name. The [`ServiceSpecification`] is JSON text in the engine's status file,
+//! An engine has iceoryx2 services for the requests (`act`) and the responses (`obs`) of each group, and for events;
+//! `docs/design/protocol.md` in the repository lists them. The [`ServiceSpecification`] is JSON text in the engine's status file,
 //! `/dev/shm/PREFIXNAME.INCARNATION.status` with the namespace's prefix. The engine holds an `flock` on this file until
 //! it ends.
 //!
