@@ -112,9 +112,9 @@ pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Drawn, Engine,
         EngineActivity, EngineConfig, EngineHandle, EngineProcesses, EngineStatus, EngineStopper, EngineSummary,
-        ErrorKind, GroupReconnection, GroupStatus, GroupsError, LastRequest, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS,
-        Namespace, Observed, Observer, ObserverStatus, Observers, Pictures, ROOT_VARIABLE, Reconnection, Rejection,
-        ServiceError, ServiceSpecification, Trainer, TrainerGroup, running_engines, timeout_from_seconds,
+        ErrorKind, GroupReconnection, GroupStatus, LastRequest, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace,
+        Observed, Observer, ObserverStatus, Observers, Pictures, ROOT_VARIABLE, Reconnection, Rejection, ServiceError,
+        ServiceSpecification, Trainer, TrainerGroup, running_engines, timeout_from_seconds,
     };
 }
 

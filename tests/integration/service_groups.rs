@@ -123,11 +123,10 @@ fn a_trainer_steps_each_group_in_a_thread() {
     let mut groups: Vec<_> = threads.into_iter().map(|thread| thread.join().unwrap()).collect();
     groups.reverse();
     let last = groups.pop().unwrap();
-    let error = Trainer::from_groups(groups).map(drop).unwrap_err();
+    let error = Trainer::from_groups(&mut groups).map(drop).unwrap_err();
     assert!(error.to_string().contains("one trainer"), "{error}");
-    let mut groups = error.groups;
     groups.push(last);
-    let mut trainer = Trainer::from_groups(groups).unwrap();
+    let mut trainer = Trainer::from_groups(&mut groups).unwrap();
     assert!(!trainer.reconnect(TIMEOUT).unwrap().restarted);
     assert_error!(trainer.group(GROUPS), ServiceError::NoSuchGroup { given: GROUPS, .. });
     engine.end();

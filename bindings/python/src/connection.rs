@@ -204,12 +204,12 @@ impl Connection {
         logs::start(py)?;
         let found = wait_for_engine(py, timeout, |slice| {
             let mut locked = self.lock_all();
-            let Some(groups) = locked.iter_mut().map(|group| group.take()).collect::<Option<Vec<_>>>() else {
+            let Some(mut groups) = locked.iter_mut().map(|group| group.take()).collect::<Option<Vec<_>>>() else {
                 return Ok(None);
             };
-            let (found, groups) = match Trainer::from_groups(groups) {
+            let (found, groups) = match Trainer::from_groups(&mut groups) {
                 Ok(mut trainer) => (trainer.reconnect(slice).map(Some), trainer.into_groups()),
-                Err(error) => (Ok(None), error.groups),
+                Err(_) => (Ok(None), groups),
             };
             locked.iter_mut().zip(groups).for_each(|(locked, group)| **locked = Some(group));
             found

@@ -147,7 +147,7 @@ pub use client::observer::{Observed, Observer, Observers};
 pub use client::pictures::{Drawn, Pictures};
 pub use client::requests::{GroupReconnection, LastRequest, Reconnection};
 pub use client::status::{EngineMonitor, EngineProcesses, EngineStatus, GroupStatus, ObserverStatus};
-pub use client::trainer::{GroupsError, Trainer};
+pub use client::trainer::Trainer;
 pub use client::trainer_group::TrainerGroup;
 pub use engine::config::{CheckpointConfig, EngineConfig};
 pub use engine::handle::{EngineHandle, EngineStopper};

@@ -1,6 +1,5 @@
 //! The trainer: sends actions to an engine and receives batches, which it reads in place.
 
-use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -47,28 +46,6 @@ pub struct Trainer {
     groups: Vec<TrainerGroup>,
 }
 
-/// The groups from which [`Trainer::from_groups`] could not make a trainer.
-#[derive(Debug)]
-#[non_exhaustive]
-pub struct GroupsError {
-    /// The groups that were given.
-    pub groups: Vec<TrainerGroup>,
-}
-
-impl fmt::Display for GroupsError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        ServiceError::MixedGroups.fmt(f)
-    }
-}
-
-impl std::error::Error for GroupsError {}
-
-impl From<GroupsError> for ServiceError {
-    fn from(_: GroupsError) -> Self {
-        ServiceError::MixedGroups
-    }
-}
-
 impl Trainer {
     /// Connects to an engine as its trainer.
     ///
@@ -109,13 +86,17 @@ impl Trainer {
         self.groups
     }
 
-    /// The trainer of these groups.
+    /// The trainer of these groups, which are taken out of `groups`. After an error, they are still there.
     ///
     /// # Errors
     ///
-    /// [`GroupsError`], with the groups, if they are not all that [`into_groups`](Trainer::into_groups) returned, in any order.
-    pub fn from_groups(mut groups: Vec<TrainerGroup>) -> Result<Self, GroupsError> {
-        if trainer_group::sort(&mut groups) { Ok(Trainer { groups }) } else { Err(GroupsError { groups }) }
+    /// [`ServiceError::MixedGroups`] if they are not all that [`into_groups`](Trainer::into_groups) returned, in any order.
+    pub fn from_groups(groups: &mut Vec<TrainerGroup>) -> Result<Self, ServiceError> {
+        if trainer_group::sort(groups) {
+            Ok(Trainer { groups: std::mem::take(groups) })
+        } else {
+            Err(ServiceError::MixedGroups)
+        }
     }
 
     fn shared(&self) -> &Arc<Shared> {
