@@ -197,32 +197,6 @@ fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
-/// Kills processes at any moment, even while they start and connect. `ENDLESS_TEST_ROUNDS=1000` covers rarer moments.
-#[test]
-#[ignore = "slow"]
-fn deaths_at_any_moment_are_survived() {
-    let place = Place::new();
-    let rounds = std::env::var("ENDLESS_TEST_ROUNDS").map_or(60, |rounds| rounds.parse().unwrap());
-    for round in 0..rounds {
-        // A process takes about 30 milliseconds to start, connect and step.
-        let moment = |step: u64| Duration::from_micros(round * step % 40_000);
-        let mut engine = place.engine("gym", 3, 2);
-        std::thread::sleep(moment(7919));
-        if round % 2 == 0 {
-            engine.kill();
-            engine = place.engine("gym", 3, 2);
-        }
-        let mut killed = place.role("trainer gym");
-        std::thread::sleep(moment(6007));
-        killed.kill();
-        let mut trainer = place.trainer("gym").unwrap_or_else(|e| panic!("round {round}: {e}"));
-        play(&mut trainer, 0, 3);
-        play(&mut trainer, 1, 3);
-    }
-    assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
-    place.assert_nothing_left();
-}
-
 #[test]
 fn an_engine_that_ends_gives_up_its_name_without_the_lock() {
     let place = Place::new();

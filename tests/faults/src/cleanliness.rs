@@ -7,9 +7,6 @@ use std::time::{Duration, Instant, SystemTime};
 use endless_gym_service::{Namespace, ROOT_VARIABLE, running_engines};
 use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
 
-/// Older than the age at which files count as abandoned.
-const ABANDONED: Duration = Duration::from_secs(60);
-
 /// How long removal may take, even on a busy machine.
 const LIMIT: Duration = Duration::from_secs(60);
 
@@ -54,9 +51,6 @@ pub fn processes(namespace: &Namespace) -> Vec<u32> {
 }
 
 /// What is left after all processes have ended and one has listed the engines.
-///
-/// Files of processes that died while they started or ended are recognised by their age. Instead of waiting, this ages
-/// them.
 pub fn leftovers(namespace: &Namespace) -> Vec<String> {
     let start = Instant::now();
     loop {
@@ -68,7 +62,6 @@ pub fn leftovers(namespace: &Namespace) -> Vec<String> {
         if left.is_empty() || start.elapsed() >= LIMIT {
             return left;
         }
-        set_age(namespace, -(ABANDONED.as_secs() as i64));
         std::thread::sleep(Duration::from_millis(50));
     }
 }
