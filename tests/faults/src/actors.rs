@@ -69,9 +69,7 @@ impl Actor {
 
     /// Sends a signal.
     pub fn signal(&self, signal: Signal) {
-        if let Some(pid) = i32::try_from(self.id()).ok().and_then(Pid::from_raw) {
-            let _ = kill_process(pid, signal);
-        }
+        self::signal(self.id(), signal);
     }
 
     /// Kills the process without letting it clean up.
@@ -124,6 +122,13 @@ impl Actor {
 impl Drop for Actor {
     fn drop(&mut self) {
         self.kill();
+    }
+}
+
+/// Sends a signal to a process, which may have ended.
+pub fn signal(process: u32, signal: Signal) {
+    if let Some(process) = i32::try_from(process).ok().and_then(Pid::from_raw) {
+        let _ = kill_process(process, signal);
     }
 }
 

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::Write;
 use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 
 use crate::actors::{self, Actor, is_crash};
 use crate::cleanliness;
@@ -174,9 +174,7 @@ impl Scene<'_> {
         let over = now();
         // The next trainer must play while the child is still running.
         self.next_batch(over, LIMIT)?;
-        if let Some(child) = i32::try_from(child).ok().and_then(Pid::from_raw) {
-            let _ = kill_process(child, Signal::KILL);
-        }
+        actors::signal(child, Signal::KILL);
         Ok(over)
     }
 

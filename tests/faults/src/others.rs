@@ -75,19 +75,20 @@ pub fn observe(habit: &Habit) {
                 }
             }
             while held.len() > habit.holds {
-                check(held.remove(0));
+                check_unchanged(held.remove(0));
             }
             std::thread::sleep(Duration::from_millis(draws.integers(0, habit.pause + 1) as u64));
         }
-        held.into_iter().for_each(check);
+        held.into_iter().for_each(check_unchanged);
     }
     Event::End.report();
 }
 
-fn check((lease, sum): (BatchLease, u32)) {
+/// Reports a batch that no longer has the checksum that it had when it was received.
+pub fn check_unchanged((lease, sum): (BatchLease, u32)) {
     if checksum(&lease) != sum {
         let (group, step) = (lease.group(), lease.step());
-        Event::Wrong { what: format!("group {group}: batch {step} changed while an observer held it") }.report();
+        Event::Wrong { what: format!("group {group}: batch {step} changed while it was held") }.report();
     }
 }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use endless_gym_core::random::entropy;
 use endless_gym_service::{Namespace, ROOT_VARIABLE};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 
 use crate::actors;
 use crate::cleanliness;
@@ -127,9 +127,7 @@ fn in_own_process(seed: u64, number: u64, plan: &Plan, stop: &AtomicBool) -> Res
 }
 
 fn kill(process: u32) {
-    if let Some(process) = i32::try_from(process).ok().and_then(Pid::from_raw) {
-        let _ = kill_process(process, Signal::KILL);
-    }
+    actors::signal(process, Signal::KILL);
 }
 
 /// A flag that Ctrl-C and SIGTERM set.

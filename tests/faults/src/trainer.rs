@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::checker::{Request, Twin, checksum};
 use crate::event::{Event, now};
+use crate::others::check_unchanged;
 use crate::shape::{SERVICE, Shape};
 
 /// How long a call waits.
@@ -62,11 +63,11 @@ impl Orders {
 pub fn run(work: &Work) -> Result<(), String> {
     let orders = Orders::read();
     let mut draws = Generator::from_seed(work.seed);
-    let mut last: Option<(Trainer, Vec<Requested>)> = None;
+    let mut last: Option<(Trainer, Vec<Group>)> = None;
     while !orders.must_stop() {
         let connected = match last.take() {
             None => connect(),
-            Some((trainer, requested)) => reconnect(trainer, &requested),
+            Some((trainer, groups)) => reconnect(trainer, &groups),
         };
         let Some(mut connected) = connected else {
             std::thread::sleep(Duration::from_millis(5));
@@ -92,19 +93,11 @@ pub fn run(work: &Work) -> Result<(), String> {
             }
             std::thread::sleep(Duration::from_micros(draws.integers(0, 2 * work.think + 1) as u64));
         }
-        last = Some((connected, play.groups.iter().map(Group::requested).collect()));
+        last = Some((connected, play.groups));
     }
     drop(last);
     Event::End.report();
     Ok(())
-}
-
-/// What a trainer knows about a group when its engine is lost.
-struct Requested {
-    /// The number of the last batch.
-    step: Option<u64>,
-    /// Whether the trainer waits for another one.
-    is_pending: bool,
 }
 
 fn connect() -> Option<Trainer> {
@@ -114,13 +107,13 @@ fn connect() -> Option<Trainer> {
 }
 
 /// Reconnects, and checks the reported fate of the last requests. A trainer that cannot reconnect connects anew.
-fn reconnect(mut trainer: Trainer, requested: &[Requested]) -> Option<Trainer> {
+fn reconnect(mut trainer: Trainer, groups: &[Group]) -> Option<Trainer> {
     for _ in 0..3 {
         Event::Connecting { at: now() }.report();
         match trainer.reconnect(PATIENCE) {
             Ok(found) => {
-                for (index, (before, group)) in requested.iter().zip(&found.groups).enumerate() {
-                    check_fate(index, before, group);
+                for (index, (group, found)) in groups.iter().zip(&found.groups).enumerate() {
+                    check_fate(index, group, found);
                 }
                 return Some(trainer);
             }
@@ -132,17 +125,18 @@ fn reconnect(mut trainer: Trainer, requested: &[Requested]) -> Option<Trainer> {
 
 /// A lost engine must have returned the batches that the trainer received, plus one if it is reported to have played
 /// the last request.
-fn check_fate(index: usize, before: &Requested, found: &GroupReconnection) {
-    let (Some(step), Some(lost)) = (before.step, found.lost_step) else { return };
+fn check_fate(index: usize, group: &Group, found: &GroupReconnection) {
+    let (Some(step), Some(lost)) = (group.step, found.lost_step) else { return };
+    let is_pending = group.pending.is_some();
     let played = match found.last_request {
-        LastRequest::Unknown if before.is_pending => 0..=1,
-        LastRequest::Played if before.is_pending => 1..=1,
+        LastRequest::Unknown if is_pending => 0..=1,
+        LastRequest::Played if is_pending => 1..=1,
         _ => 0..=0,
     };
     if !played.contains(&lost.saturating_sub(step)) || lost < step {
         let what = format!(
-            "group {index}: batch {step} was received, pending: {}; the lost engine returned {lost}, and its last request is {:?}",
-            before.is_pending, found.last_request
+            "group {index}: batch {step} was received, pending: {is_pending}; the lost engine returned {lost}, and its last request is {:?}",
+            found.last_request
         );
         Event::Miscounted { what }.report();
     }
@@ -162,12 +156,6 @@ struct Group {
     was_reset: bool,
     /// The number of the last batch.
     step: Option<u64>,
-}
-
-impl Group {
-    fn requested(&self) -> Requested {
-        Requested { step: self.step, is_pending: self.pending.is_some() }
-    }
 }
 
 /// The call that failed, and why.
@@ -213,7 +201,7 @@ impl<'a> Play<'a> {
             if found.restarted {
                 // The engine has just been replaced, and the new one knows none of these requests.
                 for (index, (group, found)) in self.groups.iter_mut().zip(&found.groups).enumerate() {
-                    check_fate(index, &group.requested(), found);
+                    check_fate(index, group, found);
                     (group.step, group.pending) = (None, None);
                 }
                 return Ok(false);
@@ -275,11 +263,7 @@ impl<'a> Play<'a> {
         }
         // An engine allows three held batches of a group, including the next one.
         while self.held.len() > draws.integers(0, 3) as usize {
-            let Some((lease, sum)) = self.held.pop_front() else { return };
-            if checksum(&lease) != sum {
-                let (group, step) = (lease.group(), lease.step());
-                Event::Wrong { what: format!("group {group}: batch {step} changed while it was held") }.report();
-            }
+            self.held.pop_front().into_iter().for_each(check_unchanged);
         }
     }
 }
