@@ -51,13 +51,6 @@ pub enum Fault {
     KillLearner { has_checkpoint: bool, moment: u64, resumed: Option<u64> },
 }
 
-/// A permission that a fault or a round needs from the machine.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Right {
-    MountNamespaces,
-    OtherUsers,
-}
-
 impl Fault {
     /// The name under which the fault is counted.
     pub fn kind(self) -> String {
@@ -88,15 +81,6 @@ impl Fault {
             }
         };
         format!("{role:?} {what}").to_lowercase()
-    }
-
-    /// The permission that it needs.
-    pub fn right(self) -> Option<Right> {
-        match self {
-            Fault::FillMemory { .. } | Fault::OtherContainer => Some(Right::MountNamespaces),
-            Fault::OtherUser => Some(Right::OtherUsers),
-            _ => None,
-        }
     }
 }
 
@@ -151,11 +135,6 @@ impl Plan {
                 .map(|_| Step { pause: draws.integers(0, 300) as u64, fault: fault(draws, own_memory.is_some()) })
                 .collect(),
         }
-    }
-
-    /// The permission that the whole round needs.
-    pub fn right(&self) -> Option<Right> {
-        self.own_memory.map(|_| Right::MountNamespaces)
     }
 }
 

@@ -3,7 +3,7 @@
 use std::process::{Command, Stdio};
 
 use crate::actors;
-use crate::plan::Right;
+use crate::plan::{Fault, Plan};
 
 /// The permissions that the machine grants.
 #[derive(Clone, Copy, Debug)]
@@ -27,12 +27,17 @@ impl Rights {
         }
     }
 
-    /// Whether a permission is granted; `None` needs none.
-    pub fn permit(self, right: Option<Right>) -> bool {
-        match right {
-            None => true,
-            Some(Right::MountNamespaces) => self.mount_namespaces,
-            Some(Right::OtherUsers) => self.other_users,
+    /// Whether they suffice for a fault.
+    pub fn permit(self, fault: Fault) -> bool {
+        match fault {
+            Fault::FillMemory { .. } | Fault::OtherContainer => self.mount_namespaces,
+            Fault::OtherUser => self.other_users,
+            _ => true,
         }
+    }
+
+    /// Whether they suffice to begin a round.
+    pub fn permit_round(self, plan: &Plan) -> bool {
+        plan.own_memory.is_none() || self.mount_namespaces
     }
 }

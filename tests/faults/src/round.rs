@@ -40,7 +40,7 @@ pub fn play(plan: &Plan, rights: Rights) -> Result<Outcome, String> {
 
 fn faults(scene: &mut Scene<'_>, rights: Rights) -> Result<(), String> {
     for step in &scene.plan.steps {
-        if !rights.permit(step.fault.right()) {
+        if !rights.permit(step.fault) {
             *scene.outcome.left_out.entry(step.fault.kind()).or_default() += 1;
             continue;
         }

@@ -51,7 +51,7 @@ pub fn run(args: &Args) -> Result<(), String> {
             break;
         }
         let plan = Plan::new(seed, number);
-        if !rights.permit(plan.right()) {
+        if !rights.permit_round(&plan) {
             *total.left_out.entry("round with a /dev/shm of its own".to_owned()).or_default() += 1;
             continue;
         }
