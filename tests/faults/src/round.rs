@@ -31,10 +31,6 @@ pub fn play(plan: &Plan, rights: Rights) -> Result<Outcome, String> {
     }
     scene.current = None;
     end(&mut scene)?;
-    scene.close();
-    for left in cleanliness::leftovers(&scene.namespace) {
-        scene.fail("left behind", left);
-    }
     Ok(std::mem::take(&mut scene.outcome))
 }
 
@@ -91,7 +87,7 @@ fn rescue(scene: &mut Scene<'_>) -> Result<bool, String> {
     Ok(next.is_some())
 }
 
-/// Ends all processes regularly.
+/// Ends all processes regularly, and finds what they leave behind.
 pub fn end(scene: &mut Scene<'_>) -> Result<(), String> {
     for other in &mut scene.others {
         other.close_input();
@@ -104,6 +100,10 @@ pub fn end(scene: &mut Scene<'_>) -> Result<(), String> {
     }
     for role in [Role::Trainer, Role::Observer, Role::Engine] {
         scene.end(role, Actor::close_input)?;
+    }
+    scene.close();
+    for left in cleanliness::leftovers(&scene.namespace) {
+        scene.fail("left behind", left);
     }
     Ok(())
 }

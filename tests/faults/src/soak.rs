@@ -114,16 +114,7 @@ pub fn run(args: &Args) -> Result<(), String> {
             break;
         }
         let end = time.mul_f64((number + 1) as f64 / ids.len() as f64);
-        let plan = Plan {
-            shape: Shape::random_of(&mut draws, id, 16),
-            trainer_seed: draws.integers(0, 1 << 40) as u64,
-            with_options: true,
-            think: 0,
-            observers: 1,
-            visitors: 1,
-            own_memory: None,
-            steps: Vec::new(),
-        };
+        let plan = calm(Shape::random_of(&mut draws, id, 16), &mut draws, true);
         let namespace = new_namespace()?;
         let must_end = || start.elapsed() >= end || stop.load(Ordering::Relaxed);
         let outcome = phase(&plan, namespace.clone(), &mut draws, start, must_end);
@@ -144,6 +135,20 @@ pub fn run(args: &Args) -> Result<(), String> {
     end(&total, seed)
 }
 
+/// A plan without faults, and without the observers and visitors of a round.
+fn calm(shape: Shape, draws: &mut Generator, with_options: bool) -> Plan {
+    Plan {
+        shape,
+        trainer_seed: draws.integers(0, 1 << 40) as u64,
+        with_options,
+        think: 0,
+        observers: 0,
+        visitors: 0,
+        own_memory: None,
+        steps: Vec::new(),
+    }
+}
+
 /// Prints the sums of a run. Failures are its error.
 fn end(total: &Outcome, seed: u64) -> Result<(), String> {
     let failures = total.failures.len();
@@ -159,16 +164,7 @@ fn starts(count: u64, seed: u64, stop: &AtomicBool) -> Result<(), String> {
         if stop.load(Ordering::Relaxed) {
             break;
         }
-        let plan = Plan {
-            shape: Shape::random(&mut draws, 4),
-            trainer_seed: draws.integers(0, 1 << 40) as u64,
-            with_options: false,
-            think: 0,
-            observers: 0,
-            visitors: 0,
-            own_memory: None,
-            steps: Vec::new(),
-        };
+        let plan = calm(Shape::random(&mut draws, 4), &mut draws, false);
         let mut scene = Scene::new(&plan, namespace.clone());
         scene.start(Role::Engine)?;
         scene.start(Role::Trainer)?;
@@ -184,10 +180,6 @@ fn starts(count: u64, seed: u64, stop: &AtomicBool) -> Result<(), String> {
             _ => scene.end(Role::Engine, Actor::close_input)?,
         }
         round::end(&mut scene)?;
-        scene.close();
-        for left in cleanliness::leftovers(&namespace) {
-            scene.fail("left behind", left);
-        }
         for failure in &scene.outcome.failures {
             println!("start {number}: FAILED: {}: {}\n    {:?}", failure.kind, failure.text, plan.shape);
         }
@@ -268,10 +260,6 @@ fn phase(
         scene.fail("unexpected end", format!("a visitor or the page: {status}: {complaint}"));
     }
     round::end(&mut scene)?;
-    scene.close();
-    for left in cleanliness::leftovers(&scene.namespace) {
-        scene.fail("left behind", left);
-    }
     if scene.outcome.batches == 0 {
         scene.fail("no batches", "the trainer has not played".to_owned());
     }
