@@ -22,6 +22,4 @@ mod printable;
 pub use printable::printable;
 
 #[cfg(test)]
-mod property_cases;
-#[cfg(test)]
 mod toy;

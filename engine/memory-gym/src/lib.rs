@@ -16,10 +16,6 @@ mod shared_methods;
 mod typed_parameters;
 mod vector;
 
-#[cfg(test)]
-#[path = "../../core/src/property_cases.rs"]
-mod property_cases;
-
 use std::sync::LazyLock;
 
 use endless_gym_core::envs::{EnvSpec, Environment};

@@ -29,8 +29,3 @@ pub type Target = fn(&mut Unstructured<'_>) -> arbitrary::Result<()>;
 pub fn run(target: Target, data: &[u8]) {
     let _ = watchdog::within_budget(data.to_vec(), || target(&mut Unstructured::new(data)));
 }
-
-/// Number of runs of a property: the environment variable `PROPTEST_CASES`, or else `cases`.
-pub fn property_cases(cases: u32) -> u32 {
-    std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(cases)
-}

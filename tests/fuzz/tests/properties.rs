@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use endless_gym_fuzz::{Target, property_cases, run};
+use endless_gym_fuzz::{Target, run};
 use proptest::prelude::*;
-use proptest::test_runner::TestRunner;
+use proptest::test_runner::{TestRunner, contextualize_config};
 
 /// The recorded inputs of a target.
 fn corpus(target: &str) -> Vec<Vec<u8>> {
@@ -44,10 +44,8 @@ fn check(name: &str, target: Target, cases: u32) {
     let corpus = corpus(name);
     corpus.iter().for_each(|input| run(target, input));
     let inputs = prop_oneof![changed(corpus), prop::collection::vec(any::<u8>(), 0..400)];
-    let mut runner = TestRunner::new(ProptestConfig {
-        failure_persistence: None,
-        ..ProptestConfig::with_cases(property_cases(cases))
-    });
+    let config = ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(cases) };
+    let mut runner = TestRunner::new(contextualize_config(config));
     runner
         .run(&inputs, |input| {
             run(target, &input);

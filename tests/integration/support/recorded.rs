@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use endless_gym::batch::PixelFormat;
 use endless_gym::envs::{EnvSpec, Parameter, ParameterKind};
 use proptest::prelude::*;
+use proptest::test_runner::contextualize_config;
 use serde_json::{Map, Value as Json};
 
 /// Calls a macro with all ids of Memory Gym, each after a name for its test.
@@ -102,6 +103,5 @@ pub fn pixel_format() -> impl Strategy<Value = PixelFormat> {
 
 /// The number of runs of a property: the environment variable `PROPTEST_CASES`, or else `cases`.
 pub fn property_cases(cases: u32) -> ProptestConfig {
-    let given = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok());
-    ProptestConfig::with_cases(given.unwrap_or(cases))
+    contextualize_config(ProptestConfig::with_cases(cases))
 }

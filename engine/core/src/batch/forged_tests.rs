@@ -1,6 +1,7 @@
 //! Forged layouts are rejected, or can be used like any other.
 
 use proptest::prelude::*;
+use proptest::test_runner::contextualize_config;
 use serde_json::{Value as Json, json};
 
 use super::*;
@@ -195,7 +196,7 @@ fn use_all(layout: &Layout) -> Result<(), TestCaseError> {
 }
 
 proptest! {
-    #![proptest_config(crate::property_cases::property_cases(2_000))]
+    #![proptest_config(contextualize_config(ProptestConfig::with_cases(2_000)))]
 
     /// Any layout that deserialises can be read and written.
     #[test]

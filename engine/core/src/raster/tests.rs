@@ -1,6 +1,7 @@
 //! Replays drawings recorded from pygame, and draws with arguments that pygame never sees.
 
 use proptest::prelude::*;
+use proptest::test_runner::contextualize_config;
 use serde::Deserialize;
 
 use super::{Canvas, CornerRadii, Disc, Rect, Rgb, Sprite, Surface, circle_outline};
@@ -168,7 +169,7 @@ fn any_picture() -> impl Strategy<Value = Surface> {
 }
 
 proptest! {
-    #![proptest_config(crate::property_cases::property_cases(400))]
+    #![proptest_config(contextualize_config(ProptestConfig::with_cases(400)))]
 
     #[test]
     fn shapes_of_any_numbers_are_drawn(

@@ -3,6 +3,7 @@
 use std::sync::{Arc, LazyLock};
 
 use proptest::prelude::*;
+use proptest::test_runner::contextualize_config;
 use serde_json::{Map, Value as Json, json};
 
 use super::features::{AGENT, COIN, EXIT, HEALTH, HIT, LAST_ACTION, LIGHT, SPOTLIGHT};
@@ -94,7 +95,7 @@ fn any_episodes() -> impl Strategy<Value = (&'static EnvSpec, Vec<Map<String, Js
 }
 
 proptest! {
-    #![proptest_config(crate::property_cases::property_cases(150))]
+    #![proptest_config(contextualize_config(ProptestConfig::with_cases(150)))]
 
     #[test]
     fn any_options_play((spec, episodes) in any_episodes(), seed: u64, steps in 0..12_usize) {

@@ -2,10 +2,10 @@
 //! ones.
 
 use proptest::prelude::*;
+use proptest::test_runner::contextualize_config;
 
 use super::*;
 use crate::batch::{Contents, batch_layout, zeroed};
-use crate::property_cases::property_cases;
 use crate::toy::toys;
 
 /// What happens to the buffers of two pools.
@@ -108,7 +108,7 @@ fn event() -> impl Strategy<Value = Event> {
 }
 
 proptest! {
-    #![proptest_config(property_cases(200))]
+    #![proptest_config(contextualize_config(ProptestConfig::with_cases(200)))]
 
     #[test]
     fn current_buffers_show_their_records_with_more_buffers_than_records(
