@@ -1,6 +1,7 @@
 //! The content of a checkpoint for each environment: a snapshot, and the earlier frames of a stack.
 
 use arbitrary::{Result, Unstructured};
+use endless_gym::environments;
 use endless_gym_core::batch::{Frames, zeroed};
 use endless_gym_core::conformance::seal;
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
@@ -16,7 +17,7 @@ pub fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let seeding = Seeding::Continue { seed: Some(3) };
     let config = PoolConfig::new(spec.id, ENVS).frames(frames).seeding(seeding).check_drawing(true);
     let pool =
-        || Pool::new(playing::registry(), &config, &Threads::new(1).expect("one thread")).expect("defaults are valid");
+        || Pool::new(environments(), &config, &Threads::new(1).expect("one thread")).expect("defaults are valid");
     let mut saving = pool();
     let mut blocks = zeroed(saving.layout().blocks());
     saving.reset(ResetRequest::Seed(1), &mut blocks).expect("a pool can be reset");

@@ -15,7 +15,7 @@ pub mod traces;
 mod watchdog;
 
 use arbitrary::Unstructured;
-pub use playing::registry;
+pub use endless_gym::environments as registry;
 pub use watchdog::BUDGET;
 
 /// A function of arbitrary bytes. An error means that it ended early because the input was too short.

@@ -1,39 +1,33 @@
 //! Pools that the targets play.
 
-use std::sync::LazyLock;
-
 use arbitrary::{Result, Unstructured};
+use endless_gym::environments;
 use endless_gym_core::batch::{Block, zeroed};
 use endless_gym_core::envs::{ActionSpace, EnvSpec};
 use endless_gym_core::pool::{
-    Autoreset, OptionMap, Pool, PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, Seeding, Threads,
+    Autoreset, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
 use endless_gym_core::random::Generator;
-use endless_gym_memory_gym::memory_gym;
-use endless_gym_popgym::register;
-
-/// All ids.
-pub fn registry() -> &'static Registry {
-    static REGISTRY: LazyLock<Registry> = LazyLock::new(|| register(memory_gym().clone()).expect("ids are unique"));
-    &REGISTRY
-}
 
 /// Any of the ids.
 pub(crate) fn spec(input: &mut Unstructured<'_>) -> Result<&'static EnvSpec> {
-    let specs: Vec<_> = registry().specs().collect();
+    let specs: Vec<_> = environments().specs().collect();
     input.choose(&specs).copied()
 }
 
-/// A pool with everything that a batch can contain, which draws each frame twice and compares the two.
-pub(crate) fn pool(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> std::result::Result<Pool, PoolError> {
-    let config = PoolConfig::new(spec.id, 1)
-        .seeding(Seeding::Continue { seed: Some(3) })
+/// One environment with everything that a batch can contain.
+pub(crate) fn config(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> PoolConfig {
+    PoolConfig::new(spec.id, 1)
         .options(ResetOptions::Shared(options))
         .autoreset(autoreset)
         .final_observation(autoreset == Autoreset::SameStep)
         .features(true)
-        .check_drawing(true);
-    Pool::new(registry(), &config, &Threads::new(1)?)
+}
+
+/// A pool with everything that a batch can contain, which draws each frame twice and compares the two.
+pub(crate) fn pool(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> std::result::Result<Pool, PoolError> {
+    let config = config(spec, options, autoreset).seeding(Seeding::Continue { seed: Some(3) }).check_drawing(true);
+    Pool::new(environments(), &config, &Threads::new(1)?)
 }
 
 /// Resets a pool.

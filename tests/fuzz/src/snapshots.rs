@@ -2,12 +2,11 @@
 
 use arbitrary::Unstructured;
 use ciborium::Value;
+use endless_gym::environments;
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::conformance::{check_numbers, seal};
 use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::pool::{
-    Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads,
-};
+use endless_gym_core::pool::{Autoreset, Pool, ResetRequest, Seeding, SnapshotError, Threads};
 use endless_gym_core::random::Generator;
 use endless_gym_memory_gym::{mortar_mayhem, mystery_path, searing_spotlights};
 use endless_gym_popgym::{
@@ -109,13 +108,8 @@ pub struct Game {
 impl Game {
     /// Creates an environment and resets it.
     pub fn new(spec: &'static EnvSpec, seeding: Seeding, options: Map<String, Json>) -> Self {
-        let config = PoolConfig::new(spec.id, 1)
-            .seeding(seeding)
-            .options(ResetOptions::Shared(options))
-            .autoreset(Autoreset::SameStep)
-            .final_observation(true)
-            .features(true);
-        let mut pool = Pool::new(playing::registry(), &config, &Threads::new(1).unwrap()).unwrap();
+        let config = playing::config(spec, options, Autoreset::SameStep).seeding(seeding);
+        let mut pool = Pool::new(environments(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
         let random = Generator::from_seed(1);
@@ -272,14 +266,19 @@ pub fn extremes() -> Vec<Value> {
     integers.chain(floats.into_iter().map(Value::Float)).chain(others).collect()
 }
 
+/// All kinds of seeding, since a snapshot holds the position in the sequence of seeds.
+pub fn seedings() -> [Seeding; 3] {
+    [
+        Seeding::Continue { seed: Some(3) },
+        Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) },
+        Seeding::List(vec![5, 6, 7]),
+    ]
+}
+
 /// The target: plays a snapshot in which some numbers, or some bytes, are replaced.
 pub fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
     let spec = playing::spec(input)?;
-    let seeding = match input.int_in_range(0..=2)? {
-        0 => Seeding::Continue { seed: Some(3) },
-        1 => Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) },
-        _ => Seeding::List(vec![5, 6, 7]),
-    };
+    let seeding = input.choose(&seedings())?.clone();
     let mut game = Game::new(spec, seeding, Map::new());
     game.play(input.int_in_range(0..=60)?);
     if input.arbitrary()? {

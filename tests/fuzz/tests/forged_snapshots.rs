@@ -6,7 +6,7 @@ use endless_gym_core::envs::{EnvSpec, ParameterKind};
 use endless_gym_core::pool::{Seeding, SnapshotError};
 use endless_gym_core::random::Generator;
 use endless_gym_fuzz::registry;
-use endless_gym_fuzz::snapshots::{Game, Outcome, at, extremes, paths};
+use endless_gym_fuzz::snapshots::{Game, Outcome, at, extremes, paths, seedings};
 use serde_json::{Map, Value as Json};
 
 /// Number of items of a forged list, more than any list gets by playing within a test.
@@ -40,15 +40,6 @@ fn long_lists_are_refused_or_played() {
             }
         }
     }
-}
-
-/// All kinds of seeding, since a snapshot holds the position in the sequence of seeds.
-fn seedings() -> [Seeding; 3] {
-    [
-        Seeding::Continue { seed: Some(3) },
-        Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) },
-        Seeding::List(vec![5, 6, 7]),
-    ]
 }
 
 /// Reset parameters with every flag set.
