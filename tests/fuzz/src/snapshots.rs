@@ -150,10 +150,8 @@ impl Game {
         })
     }
 
-    /// Restores a snapshot in which the bytes from `place` on are replaced, and plays it unless it is refused.
-    pub fn try_to_play_bytes(&mut self, snapshot: &[u8], place: usize, bytes: &[u8]) -> Outcome {
-        let mut forged = snapshot.to_vec();
-        forged.iter_mut().skip(place).zip(bytes).for_each(|(at, byte)| *at = *byte);
+    /// Restores a snapshot with changed bytes, and plays it unless it is refused.
+    fn try_to_play_bytes(&mut self, mut forged: Vec<u8>) -> Outcome {
         seal(&mut forged);
         within_budget(forged.clone(), || {
             let restored = self.pool.restore(0, &forged);
@@ -287,7 +285,7 @@ pub fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
             let place = input.choose_index(snapshot.len())?;
             snapshot[place] = input.arbitrary()?;
         }
-        game.try_to_play_bytes(&snapshot, 0, &[]);
+        game.try_to_play_bytes(snapshot);
         return Ok(());
     }
     let (mut content, extremes) = (game.content(), extremes());
