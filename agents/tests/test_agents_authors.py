@@ -1,4 +1,4 @@
-"""The memories against recorded results of the code of the paper's authors, with the same weights; see `record_authors.py`."""
+"""The memories against recorded results of the code of the paper's authors, with the same weights; see `references/README.md`."""
 
 import gzip
 import json
