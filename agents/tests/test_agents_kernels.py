@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from other_device import REPLACED
 from torch import Tensor
 
 from endless_gym import _native
@@ -19,50 +21,9 @@ from endless_gym_agents.memories.sequence_model import SequenceModel
 SHAPES = [(1, 1, 1), (1, 3, 33), (32, 8, 128), (5, 9, 7), (29, 1, 12), (3, 17, 40)]
 
 
-class Cells:
-    """What PyTorch's fused cells compute on CUDA; the workspaces hold what the backward pass needs."""
-
-    @staticmethod
-    def _thnn_fused_gru_cell(inputs: Tensor, gates: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        x, h = inputs.chunk(3, 1), gates.chunk(3, 1)
-        reset, update = (x[0] + h[0]).sigmoid(), (x[1] + h[1]).sigmoid()
-        candidate = (x[2] + reset * h[2]).tanh()
-        return candidate + update * (hidden - candidate), torch.cat([reset, update, candidate, hidden, h[2]], 1)
-
-    @staticmethod
-    def _thnn_fused_gru_cell_backward(grad: Tensor, workspace: Tensor, _: bool) -> tuple[Tensor | None, ...]:
-        reset, update, candidate, hidden, h = workspace.chunk(5, 1)
-        of_candidate = grad * (1 - update) * (1 - candidate.square())
-        of_update = grad * (hidden - candidate) * update * (1 - update)
-        of_reset = of_candidate * h * reset * (1 - reset)
-        inputs, gates = ([of_reset, of_update, last] for last in (of_candidate, of_candidate * reset))
-        return torch.cat(inputs, 1), torch.cat(gates, 1), grad * update, None, None
-
-    @staticmethod
-    def _thnn_fused_lstm_cell(inputs: Tensor, gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        entry, forget, candidate, exit_ = (inputs + gates).chunk(4, 1)
-        entry, forget, candidate, exit_ = entry.sigmoid(), forget.sigmoid(), candidate.tanh(), exit_.sigmoid()
-        cell = forget * cell + entry * candidate
-        return exit_ * cell.tanh(), cell, torch.cat([entry, forget, candidate, exit_], 1)
-
-    @staticmethod
-    def _thnn_fused_lstm_cell_backward_impl(
-        grad: Tensor, grad_cell: Tensor, before: Tensor, cell: Tensor, workspace: Tensor, _: bool
-    ) -> tuple[Tensor, Tensor, None]:
-        entry, forget, candidate, exit_ = workspace.chunk(4, 1)
-        of_cell = grad_cell + grad * exit_ * (1 - cell.tanh().square())
-        of_gates = [
-            of_cell * candidate * entry * (1 - entry),
-            of_cell * before * forget * (1 - forget),
-            of_cell * entry * (1 - candidate.square()),
-            grad * cell.tanh() * exit_ * (1 - exit_),
-        ]
-        return torch.cat(of_gates, 1), of_cell * forget, None
-
-
 def fused_layers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute the layers as on CUDA, but for the fused cells themselves."""
-    monkeypatch.setattr(fused, "aten", Cells)
+    monkeypatch.setattr(fused, "aten", SimpleNamespace(**REPLACED))
     monkeypatch.setattr("endless_gym_agents.memories.gated.KernelGRU", fused.FusedGRU)
     monkeypatch.setattr("endless_gym_agents.memories.gated.KernelLSTM", fused.FusedLSTM)
 
@@ -124,7 +85,7 @@ def test_arrays_of_other_shapes_are_refused() -> None:
 
 def test_pytorch_has_the_fused_cells_as_expected() -> None:
     """They run on CUDA only; a version of PyTorch that changes them fails here."""
-    found = [str(getattr(torch.ops.aten, name).default._schema) for name in vars(Cells) if name.startswith("_thnn")]
+    found = [str(getattr(torch.ops.aten, name).default._schema) for name in REPLACED if "thnn" in name]
     assert found == [
         "aten::_thnn_fused_gru_cell(Tensor input_gates, Tensor hidden_gates, Tensor hx, Tensor? input_bias=None, "
         "Tensor? hidden_bias=None) -> (Tensor, Tensor)",
