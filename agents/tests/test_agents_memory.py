@@ -257,27 +257,6 @@ def _plain_block(block: Block, x: torch.Tensor, tokens: list[torch.Tensor], ages
     return x + added if block.gate_fc is None else block.gate_fc(x, added)
 
 
-def test_bootstrap_value_does_not_change_the_memory() -> None:
-    for kind in ("none", "position", "stack", "gru", "lstm", "trxl"):
-        agent, observed = make(kind), observations(4, ENVS)
-        memory = agent.initial_memory(ENVS)
-        for step in range(3):
-            agent.act({"features": observed[step]}, memory)
-        once = agent.bootstrap_value({"features": observed[3]}, memory)
-        assert torch.equal(agent.bootstrap_value({"features": observed[3]}, memory), once)
-        assert_close(agent.act({"features": observed[3]}, memory).value, once)
-
-
-def test_memory_resumes_from_its_state_dict() -> None:
-    for name in KINDS:
-        agent, observed, done = agent_of(name), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
-        memory, other = agent.initial_memory(ENVS), agent.initial_memory(ENVS)
-        play(agent, memory, observed[:STEPS], done[:STEPS])
-        other.load_state_dict(memory.state_dict())
-        one, two = (play(agent, m, observed[STEPS:], done[STEPS:])[3] for m in (memory, other))
-        assert torch.equal(one, two)
-
-
 def test_kv_cache_is_recomputed_when_a_segment_begins() -> None:
     """After an update of the weights, the outputs use the new weights."""
     agent, observed, done = make("trxl"), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
