@@ -1,6 +1,5 @@
 """Checkpoints that are truncated, damaged, foreign, forged or cannot be written."""
 
-import contextlib
 import errno
 import itertools
 import json
@@ -12,7 +11,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -249,34 +248,6 @@ def test_a_checkpoint_without_the_state_of_the_run_cannot_be_resumed(
     assert train.main() == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and message in error, error
-
-
-@contextlib.contextmanager
-def forked(work: Callable[[], object]) -> Iterator[int]:
-    """A process that does some work; its id."""
-    if not (process := os.fork()):
-        with contextlib.suppress(Exception):
-            work()
-            os._exit(0)
-        os._exit(1)
-    yield process
-
-
-@pytest.mark.parametrize("megabytes", [0.0, 0.02])
-def test_a_full_disk_leaves_the_former_checkpoint(megabytes: float, file: Path, tmp_path: Path) -> None:
-    run, state = tmp_path / "run", torch.load(file, weights_only=True)
-    folder = checkpoint.save(run, state, False, megabytes).parent
-    former = contents(folder)
-
-    def save(limit: int) -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-        with pytest.raises(OSError, match="File too large"):
-            checkpoint.save(run, state | {"steps": 1}, True, megabytes)
-
-    for limit in (0, 1000, max(map(len, former.values())) // 2):
-        with forked(lambda limit=limit: save(limit)) as process:  # type: ignore[misc]
-            assert os.waitpid(process, 0)[1] == 0
-        assert contents(folder) == former
 
 
 def test_a_disk_that_is_full_after_some_parts_leaves_no_others(
