@@ -251,7 +251,8 @@ class Module(backend_registration._DummyBackendModule):
     Event = Event
 
     def current_stream(self, device: Any) -> None:
-        return None
+        # Without a device, this would be the stream of the current one, which need not be the tensor's.
+        assert device.type == NAME
 
     def cudart(self) -> type[Runtime]:
         return Runtime
