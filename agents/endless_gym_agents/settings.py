@@ -38,6 +38,13 @@ PAPER_STEPS_PER_UPDATE = 32 * 512
 #: that of fully observable twins.
 VECTORS, ONE_HOT, STATES = (f"endless_gym_agents.popgym:{name}" for name in ("Vectors", "OneHot", "States"))
 
+#: An example for each setting that lists items NAME=VALUE.
+_EXAMPLES = {
+    "environment.option": "'command_count=[2]'",
+    "agent_option": "'layers=2'",
+    "encoder_option": "'width=256'",
+}
+
 
 def paper_run_length(env: str, agent: str) -> int:
     """Updates of the paper's runs, according to its published curves; for runs that it does not have, those of the closest one.
@@ -298,29 +305,27 @@ class Settings:
     model: Model = field(default_factory=Model)
     ppo: PPO = field(default_factory=PPO)
 
-    def options(self) -> dict[str, Any]:
-        """The reset parameters by name.
+    def options(self, of: str = "environment.option") -> dict[str, Any]:
+        """The reset parameters, or the arguments of an agent or encoder of your own, by name.
+
+        Args:
+            of: Name of the setting that lists them as NAME=VALUE, such as `agent_option`.
 
         Raises:
-            ValueError: A parameter is not NAME=VALUE, or its value is not JSON.
+            ValueError: An item is not NAME=VALUE, or its value is not JSON.
         """
-        return _named_values("--environment.option", self.environment.option, "'command_count=[2]'")
-
-    def agent_options(self) -> dict[str, Any]:
-        """The arguments of an agent of your own by name.
-
-        Raises:
-            ValueError: As for `options`.
-        """
-        return _named_values("--agent-option", self.agent_option, "'layers=2'")
-
-    def encoder_options(self) -> dict[str, Any]:
-        """The arguments of an encoder of your own by name.
-
-        Raises:
-            ValueError: As for `options`.
-        """
-        return _named_values("--encoder-option", self.encoder_option, "'width=256'")
+        values = {}
+        for given in value(self, of):
+            name, equals, text = given.partition("=")
+            try:
+                values[name] = json.loads(text.lower() if text in ("True", "False") else text)
+            except json.JSONDecodeError:
+                equals = ""
+            if not equals:
+                raise ValueError(
+                    f"--{of.replace('_', '-')} must be NAME=VALUE with a JSON value, such as {_EXAMPLES[of]}, got `{given}`"
+                )
+        return values
 
     @property
     def agent_class(self) -> str:
@@ -350,14 +355,14 @@ class Settings:
             raise ValueError(
                 f"--agent must be one of {', '.join(AGENTS)}, or module:Class or file.py:Class, got `{self.agent}`{hint}"
             )
-        if self.agent_options() and not self.agent_class:
+        if self.options("agent_option") and not self.agent_class:
             classes = ", ".join(MEMORIES)
             raise ValueError(f"--agent-option is for {classes} and agents of your own, got --agent {self.agent}")
         if self.recurrence.match_gru and not (self.agent_class or self.agent in ("gru", "lstm")):
             raise ValueError(f"--recurrence.match-gru is for recurrent memories, got --agent {self.agent}")
         if self.encoder:
             own.load("--encoder", self.encoder, nn.Module)
-        elif self.encoder_options():
+        elif self.options("encoder_option"):
             raise ValueError("--encoder-option needs an encoder of your own, got no --encoder")
         for wrapper in self.environment.wrapper:
             own.load("--environment.wrapper", wrapper, VectorWrapper)
@@ -423,24 +428,6 @@ class Settings:
         """Longest possible episode in steps; 0 in endless environments and without a step limit."""
         described = spec(self.env)
         return max(0, described.max_episode_steps(self.options())) if described.learnt else 0
-
-
-def _named_values(flag: str, items: tuple[str, ...], example: str) -> dict[str, Any]:
-    """The values of items NAME=VALUE by name.
-
-    Raises:
-        ValueError: An item is not NAME=VALUE, or its value is not JSON.
-    """
-    values = {}
-    for given in items:
-        name, equals, text = given.partition("=")
-        try:
-            values[name] = json.loads(text.lower() if text in ("True", "False") else text)
-        except json.JSONDecodeError:
-            equals = ""
-        if not equals:
-            raise ValueError(f"{flag} must be NAME=VALUE with a JSON value, such as {example}, got `{given}`")
-    return values
 
 
 def value(settings: Settings, name: str) -> Any:

@@ -196,7 +196,7 @@ class Agent(nn.Module):
             self.transform = PositionalEncoding(shapes, self.device)
         if settings.encoder:
             own_encoder = own.load("--encoder", settings.encoder, nn.Module)
-            self.encoder: Encoder = OwnEncoder(own_encoder, self.transform.shapes, settings.encoder_options())
+            self.encoder: Encoder = OwnEncoder(own_encoder, self.transform.shapes, settings.options("encoder_option"))
         else:
             self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
         self.memory: AnyMemory
@@ -208,7 +208,9 @@ class Agent(nn.Module):
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
         elif settings.agent_class:
             layer = own.load("--agent", settings.agent_class, nn.Module)
-            self.memory = RecurrentMemory(layer, self.encoder.width, recurrence, self.device, settings.agent_options())
+            self.memory = RecurrentMemory(
+                layer, self.encoder.width, recurrence, self.device, settings.options("agent_option")
+            )
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
         has_memory = not isinstance(self.memory, NoMemory)
