@@ -25,7 +25,7 @@ from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common.clock import Clock
 from endless_gym_agents.common.command import STOP_SIGNALS
 from endless_gym_agents.environments.groups import Environments
-from endless_gym_agents.evaluation import enjoy, export, plot, protocol, record
+from endless_gym_agents.evaluation import export, plot, protocol, record
 from endless_gym_agents.evaluation.evaluate import evaluate
 from endless_gym_agents.settings import (
     ONE_HOT,
@@ -205,12 +205,6 @@ def test_a_run_in_an_environment_of_integers_is_recorded_and_exported(
     assert [result["length"] for result in results[0]] == [result["length"] for result in results[1]]
 
 
-def test_an_episode_of_a_run_is_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, picture = new_run(tmp_path / "run", "--agent mingru --ppo.updates 1"), tmp_path / "episode.webp"
-    monkeypatch.setattr(sys, "argv", ["endless-enjoy", str(run), "--seeds", "200000", "--out", str(picture)])
-    assert enjoy.main() == 0 and picture.stat().st_size > 1_000
-
-
 def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = new_run(tmp_path / "rust", "--ppo.updates 1")
     given = parse(f"--env {GRID} --preset quick {FLAGS} --threads 1 --ppo.updates 1".split())
@@ -229,27 +223,13 @@ def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monk
 def test_a_damaged_or_forged_checkpoint_is_refused(tmp_path: Path) -> None:
     run = new_run(tmp_path / "run", "--ppo.updates 1")
     file = run / "checkpoints" / "last.safetensors"
-    content, draws = np.fromfile(file, np.uint8), np.random.default_rng(3)
+    content = np.fromfile(file, np.uint8)
     for length in (*range(0, len(content), 997), len(content) - 1):
         content[:length].tofile(file)
         with pytest.raises(ValueError, match="safetensors"):
             checkpoint.load(file)
     content.tofile(file)
     weights, whole = load_file(file), checkpoint.load(file).state
-    refused = 0
-    for _ in range(100):
-        damaged = content.copy()
-        damaged[draws.integers(len(content))] ^= draws.integers(1, 256, dtype=np.uint8)
-        damaged.tofile(file)
-        try:
-            state = checkpoint.load(file).state
-        except ValueError:
-            refused += 1
-        else:
-            # As in a space after the header.
-            assert all(torch.equal(tensor, state["model"][name]) for name, tensor in whole["model"].items())
-    assert refused > 98
-    content.tofile(file)
     # Version 1 needs no checksum.
     header = {name: whole[name] for name in ("settings", "update", "steps")} | {"version": 1}
     for text in ("[" * 100_000, '{"a":' * 100_000, "[]", "3", "{}", json.dumps(header | {"settings": 3})):
