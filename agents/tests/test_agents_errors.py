@@ -46,11 +46,8 @@ PROGRAMS = {
         *(
             (f"endless-train {GRID} --{flag} {given}", f"--{flag} must be {allowed}, got {given}")
             for flag, given, allowed in (
-                ("environment.num-envs", "0", "1 or more"),
                 ("seed", "-1", "0 or more"),
-                ("time-limit", "-3.0", "0 or more"),
                 ("target-reward", "nan", "finite"),
-                ("ppo.learning-rate", "nan", "0 or more"),
                 ("ppo.final-learning-rate", "inf", "0 or more"),
                 ("ppo.clip-range", "0.0", "greater than 0"),
                 ("ppo.gamma", "1.5", "0 to 1"),
@@ -63,10 +60,6 @@ PROGRAMS = {
         ),
         ("endless-train --env mortarmayhem-grid-v0", "id must be .*; did you mean MortarMayhem-Grid-v0?"),
         ("endless-eval text.pt --seeds 0", "--seeds must be 1 or more, got 0"),
-        ("endless-eval text.pt --threads -1", "--threads must be 0 or more, got -1"),
-        ("endless-eval text.pt --first-seed -1", "--first-seed must be 0 or more, got -1"),
-        ("endless-enjoy text.pt --fps -1", "--fps must be 0 or more, got -1"),
-        ("endless-enjoy text.pt --max-steps -1", "--max-steps must be 0 or more, got -1"),
         ("endless-enjoy text.pt --seeds 1 -1", "--seeds must be 0 or more, got -1"),
         ("endless-probe text.pt --max-steps 0", "--max-steps must be 1 or more, got 0"),
         ("endless-record text.pt", "text.pt is not a checkpoint, or is truncated: "),
@@ -74,7 +67,6 @@ PROGRAMS = {
         ("endless-plot --published gru nope", "--published must be among gru, .*, got `nope`"),
         ("endless-reproduce finite --seeds -1 --status", "--seeds must be 0 or more, got -1"),
         ("endless-eval text.pt --json none/results.json", "cannot write none/results.json: no folder none"),
-        ("endless-eval text.pt --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
         ("endless-enjoy nowhere", "no checkpoint nowhere"),
         ("endless-enjoy nowhere --seeds", "--seeds must contain at least one seed, got none"),
         ("endless-plot nowhere.json", "no such file or folder: nowhere.json"),
@@ -90,11 +82,6 @@ PROGRAMS = {
         ("endless-search --percentile 0", "--percentile must be greater than 0 and at most 100, got 0.0"),
         ("endless-search --run mine", "--run and --resume are not supported: the search names its runs; use --folder"),
         ("endless-search --time-limit 3", "--time-limit and --target-reward are not supported: "),
-        ("endless-search --ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
-        ("endless-search --trials -1", "--trials must be 0 or more, got -1"),
-        ("endless-search --period 0", "--period must be 1 or more, got 0"),
-        ("endless-search --workers -1", "--workers must be 0 or more, got -1"),
-        ("endless-search --trial-cpus 0", "--trial-cpus must be 1 or more, got 0"),
         ("endless-search --ray", NO_RAY),
         ("endless-reproduce", "no experiment given; `endless-reproduce --list` lists them"),
         ("endless-reproduce nope", "experiment must be one of finite, .*; got `nope`"),
@@ -102,7 +89,6 @@ PROGRAMS = {
         ("endless-reproduce finite --scale 2", "--scale must be greater than 0 and at most 1, or tiny; got `2`"),
         ("endless-reproduce finite --scale small", "--scale must be .* got `small`"),
         ("endless-reproduce finite --nice 20 --status", "--nice must be 0 to 19, got 20"),
-        ("endless-reproduce finite --jobs -1 --status", "--jobs must be 0 or more, got -1"),
         ("endless-reproduce endless --ray", NO_RAY),
         ("endless-compare", "no path given; expected files of `endless-eval --json`"),
         ("endless-compare nowhere", "no such file or folder: nowhere; expected results"),
@@ -119,9 +105,6 @@ PROGRAMS = {
         ("endless-leaderboard text.json", "track text: `tasks` is unknown, missing or empty; allowed: about, tasks"),
         ("endless-leaderboard million --tasks nope", "--tasks must be among repeat-first-12, .*, got `nope`"),
         ("endless-leaderboard million --sizes tiny", "--sizes must be among gru, got `tiny`"),
-        ("endless-leaderboard million --scale 2", "--scale must be greater than 0 and at most 1, or tiny; got `2`"),
-        ("endless-reproduce endless --ray auto --job-cpus 0", "--job-cpus must be 1 or more, got 0"),
-        ("endless-reproduce endless --ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
     ],
 )
 def test_user_error_prints_one_line_and_leaves_no_file(
@@ -151,28 +134,13 @@ def test_user_error_prints_one_line_and_leaves_no_file(
     }
 
 
-@pytest.mark.parametrize(
-    ("command", "given", "meant"),
-    [
-        (f"endless-train {GRID}", "--ppo.num-epochs 0", "--ppo.epochs"),
-        (f"endless-train {GRID}", "--agnet gru", "--agent"),
-        ("endless-eval .", "--sedes 3", "--seeds"),
-        ("endless-enjoy .", "--seed 3", "--seeds"),
-        ("endless-plot", "--agregate endless", "--aggregate"),
-        ("endless-probe .", "--episode 10", "--episodes"),
-        ("endless-search", "--prunner asha", "--pruner"),
-        ("endless-reproduce finite", "--scales 1", "--scale"),
-        ("endless-compare .", "--metrics reward", "--metric"),
-        ("endless-leaderboard million", "--agent gru", "--agents"),
-    ],
-)
 def test_an_unknown_flag_suggests_the_nearest(
-    command: str, given: str, meant: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", [*command.split(), *given.split()])
+    monkeypatch.setattr(sys, "argv", ["endless-train", "--ppo.num-epochs", "0"])
     with pytest.raises(SystemExit) as ended:
-        PROGRAMS[command.split()[0]]()
+        train.main()
     assert ended.value.code == 2
     error = capsys.readouterr().err
-    assert re.search(rf"Unrecognized options: {given.split()[0]}\b", error), error
-    assert re.search(rf"Perhaps you meant:.*{meant}\b", error, re.DOTALL), error
+    assert re.search(r"Unrecognized options: --ppo\.num-epochs\b", error), error
+    assert re.search(r"Perhaps you meant:.*--ppo\.epochs\b", error, re.DOTALL), error
