@@ -39,13 +39,7 @@ from endless_gym.specs import Frames, Spec
 from endless_gym_agents.agent.acting import ActingWeights, acting_weights, weights_version
 from endless_gym_agents.agent.encoders import FRAME, Encoder, Observation, OwnEncoder, Shapes
 from endless_gym_agents.agent.heads import Perceptron, PolicyHead, ReconstructionHead, ValueHead
-from endless_gym_agents.agent.transforms import (
-    FrameStack,
-    Identity,
-    ObservationTransform,
-    PositionalEncoding,
-    TransformState,
-)
+from endless_gym_agents.agent.transforms import FrameStack, ObservationTransform, PositionalEncoding, TransformState
 from endless_gym_agents.common import own
 from endless_gym_agents.environments import wrappers
 from endless_gym_agents.memories.layers import linear_relu, orthogonal
@@ -189,7 +183,7 @@ class Agent(nn.Module):
         self.branches = tuple(branches)
         #: Shapes of one environment's observation, by key.
         self.observation_shapes = {key: tuple(shape) for key, shape in shapes.items()}
-        self.transform: ObservationTransform = Identity(shapes)
+        self.transform = ObservationTransform(shapes)
         if settings.agent == "stack":
             self.transform = FrameStack(shapes, settings.model.stack, self.device)
         elif settings.agent == "position":

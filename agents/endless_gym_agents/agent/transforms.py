@@ -6,7 +6,6 @@ encoded step number of the episode. It has a state between steps, as a memory do
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import TypeAlias
 
 import torch
@@ -24,17 +23,21 @@ POSITION = "position"
 TransformState: TypeAlias = dict[str, Tensor]
 
 
-class ObservationTransform(ABC):
-    """Turns the environments' observation into the agent's."""
+class ObservationTransform:
+    """Turns the environments' observation into the agent's; this one leaves it unchanged.
 
-    #: Shapes of the agent's observation.
-    shapes: Shapes
+    Attributes:
+        shapes: Shapes of the agent's observation.
+    """
 
-    @abstractmethod
+    def __init__(self, shapes: Shapes) -> None:
+        """Make the transform for observations of these shapes."""
+        self.shapes = shapes
+
     def initial_state(self, num_envs: int) -> TransformState:
         """The state of `num_envs` environments before their first step."""
+        return {}
 
-    @abstractmethod
     def apply(
         self, observation: Observation, state: TransformState, reset_mask: Tensor
     ) -> tuple[Observation, TransformState]:
@@ -48,21 +51,6 @@ class ObservationTransform(ABC):
         Returns:
             The agent's observation, and the state after this step.
         """
-
-
-class Identity(ObservationTransform):
-    """The environments' observation, unchanged."""
-
-    def __init__(self, shapes: Shapes) -> None:
-        """Make the transform for observations of these shapes."""
-        self.shapes = shapes
-
-    def initial_state(self, num_envs: int) -> TransformState:
-        return {}
-
-    def apply(
-        self, observation: Observation, state: TransformState, reset_mask: Tensor
-    ) -> tuple[Observation, TransformState]:
         return observation, {}
 
 

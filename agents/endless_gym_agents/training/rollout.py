@@ -21,7 +21,7 @@ from torch import Tensor
 
 from endless_gym_agents.agent.agent import Agent, AgentMemory
 from endless_gym_agents.agent.encoders import FRAME, Observation
-from endless_gym_agents.agent.transforms import Identity, TransformState
+from endless_gym_agents.agent.transforms import ObservationTransform, TransformState
 from endless_gym_agents.common.clock import Clock
 from endless_gym_agents.environments.groups import Environments, StepResult
 from endless_gym_agents.environments.ranks import Ranks
@@ -146,7 +146,7 @@ class RolloutCollector:
         self._ground_truth: Tensor | None = None
         if agent.ground_truth is not None:
             self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
-        are_frames = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
+        are_frames = list(agent.observation_shapes) == [FRAME] and type(agent.transform) is ObservationTransform
         self._frames: EmbeddedFrames | None = None
         if are_frames and device.type == "cpu":
             self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
@@ -223,7 +223,7 @@ class RolloutCollector:
         upload = self._uploads[group]
         with clock.measure("inference"):
             slots, update = part.observation[step], TransformState()
-            if isinstance(agent.transform, Identity):
+            if type(agent.transform) is ObservationTransform:
                 # Copy straight into the segment, where the network reads it.
                 for key, value in agent.as_mapping(current.observation).items():
                     upload.copy(value, slots[key])
