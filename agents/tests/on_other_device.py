@@ -229,7 +229,7 @@ def training(folder: Path) -> None:
 
 def waits(folder: Path) -> None:
     """A rollout waits only for the actions and copies each observation once; an update waits only for its metrics."""
-    for agent in ("gru", "trxl", "stack"):
+    for agent in (*test_agents_operations.BUDGETS, "stack"):
         given = test_agents_operations.small(agent)
         steps, groups = given.ppo.steps, given.environment.groups
         with collecting(given, NAME) as collector:

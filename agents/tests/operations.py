@@ -1,4 +1,4 @@
-"""Counts the operations that PyTorch dispatches, and those that wait for a device."""
+"""Counts the operations that PyTorch dispatches."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections import Counter
 from typing import Any
 
 import torch
-from other_device import WAITING
 from torch.utils._python_dispatch import TorchDispatchMode
 
 
@@ -25,11 +24,6 @@ class Operations(TorchDispatchMode):
     def computed(self) -> int:
         """Number of operations that compute something."""
         return self.calls.total()
-
-    @property
-    def waiting(self) -> int:
-        """Number of operations that wait for a device."""
-        return sum(number for name, number in self.calls.items() if name in WAITING)
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = operation.overloadpacket.__name__
