@@ -214,13 +214,3 @@ def test_the_table_says_which_metric_to_trust() -> None:
     del episodes[0]["commands_completed"]
     for env in ("MysteryPath-v0", "SearingSpotlights-v0"):
         assert "*" not in printed(env) and "Trust" not in printed(env)
-
-
-def test_ctrl_c_stops_cleanly(runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(*arguments: object, **more: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(protocol, "evaluate", interrupted)
-    monkeypatch.setattr(sys, "argv", ["endless-eval", str(runs)])
-    assert protocol.main() == 130
-    assert capsys.readouterr().err == "endless-eval: stopped\n"

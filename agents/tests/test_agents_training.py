@@ -264,15 +264,6 @@ def test_weights_and_biases_logs_contain_the_metrics_under_one_id(
     assert b"episode/reward" in written and b"decay_updates" in written
 
 
-@pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
-def test_bf16_changes_results_slightly_and_keeps_float32_weights(agent: str, tmp_path: Path) -> None:
-    plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
-    one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
-    assert one != two
-    assert one == pytest.approx(two, rel=0.2)
-    assert all(tensor.dtype == torch.float32 for tensor in checkpoint.load(coarse).agent.state_dict().values())
-
-
 @pytest.mark.timeout(600)
 def test_a_transformer_learns_a_command_that_is_shown_and_hidden(tmp_path: Path) -> None:
     """As a GRU does in `test_agents_example.py`."""
