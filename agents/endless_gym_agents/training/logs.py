@@ -136,17 +136,10 @@ class SilentLogger(Logger):
     def __init__(self) -> None:
         """Open nothing."""
 
-    def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
-        pass
+    def _nothing(self, *given: object) -> None:
+        """Write nothing."""
 
-    def sync(self) -> None:
-        pass
-
-    def print(self, text: str) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
+    update = sync = print = close = _nothing  # type: ignore[assignment]
 
 
 def means(episodes: Collection[dict[str, float]]) -> dict[str, float]:
