@@ -63,6 +63,7 @@ def test_task_progress_uses_the_path_length_of_each_seed() -> None:
         ("--agent gru", "gru"),
         ("--agent gru --recurrence.hidden-size 384", "gru_384"),
         ("--agent gru --ppo.reconstruction-coefficient 0.1", "gru_rec"),
+        ("--agent retnet --recurrence.hidden-size 64", "retnet_64"),
         ("--agent lstm", "lstm"),
         ("--agent none", "ppo"),
         ("--agent stack --model.stack 16", "16stack"),
@@ -80,7 +81,7 @@ def test_labels_match_the_published_results(flags: str, expected: str) -> None:
     assert label(parse(flags.split())) == expected
     published = json.loads((Path(endless_gym_agents.__file__).parent / "evaluation/published.json").read_text())
     names = {name for curves in published["curves"].values() for name in curves}
-    assert expected.replace("_learned", "_lr_learned") in names | {"trxl_qprev"}
+    assert expected.replace("_learned", "_lr_learned") in names | {"trxl_qprev", "retnet_64"}
 
 
 def test_runs_and_checkpoints_are_found(runs: Path) -> None:

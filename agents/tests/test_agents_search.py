@@ -40,6 +40,8 @@ def test_search_space_is_the_table_of_the_paper() -> None:
     assert trxl["transformer.initialisation"] == ("xavier", "orthogonal", "kaiming", "tfixup")
     assert "transformer.layers" not in gru
     assert "recurrence.layers" not in trxl
+    lru = space(replace(PRESETS["paper"], agent="lru"))
+    assert lru == {name: choices for name, choices in gru.items() if name not in ("agent", "recurrence.residual")}
     # The table has 8 common parameters with 16 alternatives, 4 with 5 for recurrence, and 5 with 10 for the Transformer-XL.
     assert (len(gru), len(single_changes(gru))) == (12, 1 + 16 + 5)
     assert (len(trxl), len(single_changes(trxl))) == (13, 1 + 16 + 10)
