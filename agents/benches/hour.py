@@ -70,11 +70,9 @@ def curve(folder: Path) -> list[tuple[float, int, float]]:
         times[row["update"]] = seconds / 60
     for file in checkpoint.files(folder):
         loaded = checkpoint.load(file)
-        settings = loaded.settings
-        loaded.agent.settings = dataclasses.replace(
-            settings, environment=dataclasses.replace(settings.environment, option=())
-        )
-        results = evaluate(loaded.agent, num_threads=1)
+        environment = dataclasses.replace(loaded.settings.environment, option=())
+        settings = dataclasses.replace(loaded.settings, environment=environment)
+        results = evaluate(loaded.agent, num_threads=1, settings=settings)
         points.append((times[loaded.update], loaded.steps, mean(results, metric(settings.env)[0])))
     return points
 

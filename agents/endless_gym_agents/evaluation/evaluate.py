@@ -10,6 +10,7 @@ import torch
 from endless_gym.specs import spec
 from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.environments import wrappers
+from endless_gym_agents.settings import Settings
 
 #: The paper's protocol: seeds that training never uses, and episodes per seed. Actions are sampled, so the episodes of a seed
 #: differ.
@@ -22,6 +23,7 @@ def evaluate(
     seeds: Sequence[int] = EVALUATION_SEEDS,
     repetitions: int = REPETITIONS,
     *,
+    settings: Settings | None = None,
     num_threads: int | None = None,
     action_seed: int = 0,
     greedy: bool = False,
@@ -30,9 +32,10 @@ def evaluate(
     """Play several episodes of each seed, all in parallel.
 
     Args:
-        agent: The agent; its settings name the environment and its reset parameters.
+        agent: The agent.
         seeds: Seeds of the episodes.
         repetitions: Episodes per seed.
+        settings: Settings of the environments; `None` for the agent's, which name its environment and reset parameters.
         num_threads: Threads that step the environments; `None` for one per core.
         action_seed: Seed of the generator that samples the actions.
         greedy: Take the most likely actions instead of sampling.
@@ -41,7 +44,8 @@ def evaluate(
     Returns:
         The final infos of all episodes, each with `seed`; all seeds in order, repeated `repetitions` times.
     """
-    settings, env_spec = agent.settings, spec(agent.settings.env)
+    settings = settings or agent.settings
+    env_spec = spec(settings.env)
     episode_seeds = [seed for _ in range(repetitions) for seed in seeds]
     num_envs = len(episode_seeds)
     memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(action_seed)

@@ -90,12 +90,8 @@ def evaluations(agent: Agent) -> list[dict[str, Any]]:
     each = [options | {"command_count": [count]} for count in counts] if len(counts) > 1 else [options]
     found = []
     for chosen in each:
-        option = command.assignments(chosen)
-        agent.settings = replace(trained, environment=replace(trained.environment, option=option))
-        try:
-            results = evaluate(agent, num_threads=1)
-        finally:
-            agent.settings = trained
+        environment = replace(trained.environment, option=command.assignments(chosen))
+        results = evaluate(agent, num_threads=1, settings=replace(trained, environment=environment))
         measured: dict[str, Any] = {"options": chosen, "episodes": len(results), "mean_reward": round(mean(results), 6)}
         if "task_progress" in results[0]:
             successes = sum(result["task_progress"] > 1.0 - 1e-6 for result in results)

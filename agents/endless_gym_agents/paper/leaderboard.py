@@ -184,13 +184,9 @@ def longer(agent: Agent, task: Task, seeds: int) -> float:
     """Mean return in the longer version of a task."""
     assert task.longer is not None
     env, options = task.longer
-    trained = agent.settings
-    environment: Environment = dataclasses.replace(trained.environment, option=options)
-    agent.settings = dataclasses.replace(trained, env=env, environment=environment)
-    try:
-        return mean(evaluate(agent, range(200_000, 200_000 + seeds), 1, num_threads=1))
-    finally:
-        agent.settings = trained
+    environment: Environment = dataclasses.replace(agent.settings.environment, option=options)
+    settings = dataclasses.replace(agent.settings, env=env, environment=environment)
+    return mean(evaluate(agent, range(200_000, 200_000 + seeds), 1, num_threads=1, settings=settings))
 
 
 def export_best(done: dict[str, list[tuple[float, Job]]], folder: Path) -> None:
