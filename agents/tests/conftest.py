@@ -29,6 +29,17 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jobs, "_POLL", 0.0)
 
 
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Calls the `main` of a program with arguments, and returns its exit status."""
+
+    def called(main: Callable[[], int], *arguments: object) -> int:
+        monkeypatch.setattr(sys, "argv", ["program", *map(str, arguments)])
+        return main()
+
+    return called
+
+
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of `small("gru", ...)` with four updates."""

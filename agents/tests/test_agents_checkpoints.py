@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -236,7 +236,7 @@ def test_a_checkpoint_without_the_state_of_the_run_cannot_be_resumed(
     message: str,
     trained: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    call: Callable[..., int],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     shutil.copytree(trained, tmp_path / "run")
@@ -244,8 +244,7 @@ def test_a_checkpoint_without_the_state_of_the_run_cannot_be_resumed(
     other(last, last, **state)
     checkpoint.load(last)
     capsys.readouterr()
-    monkeypatch.setattr(sys, "argv", ["endless-train", "--resume", str(tmp_path / "run"), "--ppo.updates", "2"])
-    assert train.main() == 1
+    assert call(train.main, "--resume", tmp_path / "run", "--ppo.updates", 2) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and message in error, error
 

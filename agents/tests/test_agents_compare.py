@@ -3,8 +3,8 @@
 import csv
 import json
 import re
-import sys
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,11 +34,6 @@ def evaluated(file: Path, label: str, option: int, rewards: list[float], steps: 
     experiment = Experiment(GRID, label, {"command_count": [option]}, runs)
     file.write_text(json.dumps(to_json([experiment], {"seeds": 2} | protocol)))
     return file
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["endless-compare", *map(str, arguments)])
-    return compare.main()
 
 
 def test_scores_are_normalised_by_none_and_the_expert(tmp_path: Path) -> None:
@@ -145,12 +140,12 @@ def test_an_agent_with_missing_runs_has_no_estimates() -> None:
     assert compare.cells(comparison)[1][1][:6] == ["lru", "2", "incomplete", "", "0.50", ""]
 
 
-def test_all_files_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_all_files_are_written(tmp_path: Path, call: Callable[..., int], capsys: Any) -> None:
     """Also with a name that LaTeX would not take."""
     for number, (label, value) in enumerate({"ppo": 0.0, "my_net_width=[1, 2]": 0.19, "gru": 0.1}.items()):
         evaluated(tmp_path / f"{number}.json", label, 2, [value, value + 0.01, round(value + 0.005, 3)])
     out = tmp_path / "out"
-    assert run(monkeypatch, tmp_path, "--out", out, "--json", tmp_path / "numbers.json") == 0
+    assert call(compare.main, tmp_path, "--out", out, "--json", tmp_path / "numbers.json") == 0
     printed = capsys.readouterr().out
     assert all(
         part in printed for part in ("my_net_width=[1, 2]", "percentile bootstrap", f"{out / 'README.md'}, with")
@@ -185,7 +180,7 @@ def test_all_files_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert ElementTree.parse(out / "comparison.svg").getroot().tag == "{http://www.w3.org/2000/svg}svg"
     # The same runs give the same bytes.
     before = {file.name: file.read_bytes() for file in out.iterdir()}
-    assert run(monkeypatch, tmp_path, "--out", out, "--json", "-") == 0
+    assert call(compare.main, tmp_path, "--out", out, "--json", "-") == 0
     assert json.loads(capsys.readouterr().out) == numbers
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 

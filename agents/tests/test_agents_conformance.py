@@ -6,6 +6,7 @@ import pty
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -144,14 +145,12 @@ def test_a_mistake_is_found(name: str, failed: set[str], tmp_path: Path) -> None
 
 
 def test_the_program_prints_the_checks_and_fails_if_one_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "own.py").write_text(MISTAKES)
     monkeypatch.chdir(tmp_path)
     for name, status in (("Right", 0), ("Rounds", 1)):
-        given = ["conformance", f"own.py:{name}", "--steps", "100", "--long-steps", "200"]
-        monkeypatch.setattr(sys, "argv", given)
-        assert conformance.main() == status
+        assert call(conformance.main, f"own.py:{name}", "--steps", 100, "--long-steps", 200) == status
         printed = capsys.readouterr()
         assert ("FAILED  agreement" in printed.out) == bool(status)
         assert "the last check plays 200 steps and is the longest: about " in printed.err

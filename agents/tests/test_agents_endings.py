@@ -30,13 +30,11 @@ from endless_gym_agents.training.train import parse, train
 
 @pytest.mark.parametrize("agent", ["gru", "trxl", "none", "position", "stack", "lstm", "gtrxl"])
 def test_a_run_that_diverges_stops_and_keeps_its_last_healthy_checkpoint(
-    agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    agent: str, tmp_path: Path, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = train(small(agent, tmp_path / "run", updates=1))
     before = (run / "checkpoints" / "last.pt").read_bytes()
-    arguments = f"endless-train --resume {run} --ppo.updates 9 --ppo.learning-rate 1e20"
-    monkeypatch.setattr(sys, "argv", arguments.split())
-    assert training.main() == 1
+    assert call(training.main, "--resume", run, "--ppo.updates", 9, "--ppo.learning-rate", 1e20) == 1
     error = capsys.readouterr().err
     assert error.startswith("endless-train: update 2 diverged: its "), error
     assert "try a smaller --ppo.learning-rate (now " in error and f"--resume {run}, which has" in error

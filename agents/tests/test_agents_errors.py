@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -108,7 +109,12 @@ PROGRAMS = {
     ],
 )
 def test_user_error_prints_one_line_and_leaves_no_file(
-    command: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    call: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "text.pt").write_text("not a checkpoint\n")
     (tmp_path / "text.json").write_text("{}")
@@ -120,9 +126,8 @@ def test_user_error_prints_one_line_and_leaves_no_file(
     if "--ray" in command:
         monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", command.split())
-    program = command.split()[0]
-    assert PROGRAMS[program]() == 1
+    program, *arguments = command.split()
+    assert call(PROGRAMS[program], *arguments) == 1
     error = capsys.readouterr().err
     assert re.match(f"{program}: {message}", error), error
     assert error.count("\n") == 1
@@ -134,12 +139,9 @@ def test_user_error_prints_one_line_and_leaves_no_file(
     }
 
 
-def test_an_unknown_flag_suggests_the_nearest(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["endless-train", "--ppo.num-epochs", "0"])
+def test_an_unknown_flag_suggests_the_nearest(call: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        train.main()
+        call(train.main, "--ppo.num-epochs", 0)
     assert ended.value.code == 2
     error = capsys.readouterr().err
     assert re.search(r"Unrecognized options: --ppo\.num-epochs\b", error), error

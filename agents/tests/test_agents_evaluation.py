@@ -3,9 +3,9 @@
 import io
 import json
 import shutil
-import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,7 +113,7 @@ def test_evaluation_plays_each_seed_equally_often_and_is_reproducible(runs: Path
 
 
 def test_the_last_checkpoints_of_runs_that_stop_when_learnt_are_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     for seed, steps in ((1, 32), (2, 64)):
         for name, stops in (("learnt", True), ("interrupted", False)):
@@ -121,9 +121,7 @@ def test_the_last_checkpoints_of_runs_that_stop_when_learnt_are_compared(
             saved(tmp_path / name / str(seed), given, steps=steps)
     file = tmp_path / "all.json"
     for name, status in (("learnt", 0), ("interrupted", 1)):
-        arguments = ["endless-eval", str(tmp_path / name), "--last", "--seeds", "2", "--json", str(file)]
-        monkeypatch.setattr(sys, "argv", arguments)
-        assert protocol.main() == status
+        assert call(protocol.main, tmp_path / name, "--last", "--seeds", 2, "--json", file) == status
         printed = capsys.readouterr()
         assert ("no checkpoints at a common number of steps" in printed.err) is bool(status)
     (summary,) = json.loads(file.read_text())["experiments"][0]["summary"]
@@ -134,14 +132,12 @@ def test_the_last_checkpoints_of_runs_that_stop_when_learnt_are_compared(
 
 
 def test_a_foreign_run_does_not_prevent_the_evaluation_of_others(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    runs: Path, tmp_path: Path, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(runs, tmp_path / "runs")
     foreign = tmp_path / "runs" / "b" / "checkpoints" / "last.pt"
     foreign.write_text("of another library\n")
-    arguments = ["endless-eval", str(tmp_path / "runs"), "--last", "--seeds", "2", "--json", str(tmp_path / "all.json")]
-    monkeypatch.setattr(sys, "argv", arguments)
-    assert protocol.main() == 1
+    assert call(protocol.main, tmp_path / "runs", "--last", "--seeds", 2, "--json", tmp_path / "all.json") == 1
     output = capsys.readouterr()
     assert output.err.startswith(f"endless-eval: the others are evaluated; {foreign} is not a checkpoint"), output.err
     assert "gru_16" in output.out and "none (ppo in the paper)" in output.out and "95 % of mean" in output.out

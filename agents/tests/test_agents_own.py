@@ -2,7 +2,7 @@
 
 import re
 import shlex
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +39,17 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("number", range(3))
 def test_the_commands_of_the_page_work(
-    number: int, file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: int,
+    file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    call: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert len(blocks("sh")) == 3
     for line in blocks("sh")[number].replace("\\\n", " ").splitlines():
         # Shorter than on the page, since a test needs only a few updates.
-        arguments = shlex.split(line.replace("--time-limit 0.1", "--time-limit 0.001"))
-        monkeypatch.setattr(sys, "argv", arguments)
-        assert PROGRAMS[arguments[0]]() == 0, line
+        program, *arguments = shlex.split(line.replace("--time-limit 0.1", "--time-limit 0.001"))
+        assert call(PROGRAMS[program], *arguments) == 0, line
     (run,) = Path("runs").iterdir()
     given = checkpoint.read_settings(run)
     assert label(given) == ("MinGRU_layers=2", "gru_128_Impala_channels=[4, 8]", "gru_128_StepPenalty")[number]
@@ -178,7 +181,7 @@ def test_a_resumed_run_with_a_wrapper_equals_an_undisturbed_one(
 
 
 def test_films_probes_and_data_sets_know_the_wrapper(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An agent of wrapped observations cannot act without the wrapper."""
     monkeypatch.chdir(tmp_path)
@@ -189,8 +192,7 @@ def test_films_probes_and_data_sets_know_the_wrapper(
     assert agent.observation_shapes["time"] == (1,)
     assert len(probe.record(agent, range(2), max_steps=4).truth) == 8
     assert len(list(enjoy.EpisodeRecorder(agent, max_steps=3).frames((5,)))) > 4
-    monkeypatch.setattr(sys, "argv", ["endless-record", str(tmp_path / "run")])
-    assert record.main() == 1
+    assert call(record.main, tmp_path / "run") == 1
     assert re.search(r"trained with --environment.wrapper .*own.py:Counting", capsys.readouterr().err)
 
 

@@ -46,12 +46,12 @@ def test_a_missing_package_is_named_with_its_extra(
     message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    call: Callable[..., int],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for name in ("matplotlib", "optuna", "tensorboard"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["program", *given.split()])
-    assert main() == 1
+    assert call(main, *given.split()) == 1
     assert f"{message}, which is not installed: pip install './agents[train]'" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -1,7 +1,7 @@
 """Probes of an agent's memory: synthetic memories with and without the answer, and a real agent's."""
 
 import json
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -76,13 +76,11 @@ def test_recording_contains_the_inputs_of_the_heads(agent: str, tmp_path: Path) 
 
 
 def test_the_command_and_its_errors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     for env in (ID, "MortarMayhem-Grid-v0"):
         saved(tmp_path / env, settings("gru", env=env))
-    command = ["endless-probe", str(tmp_path / ID), "--episodes", "5", "--max-steps", "20"]
-    monkeypatch.setattr(sys, "argv", [*command, "--json"])
-    assert probe.main() == 0
+    assert call(probe.main, tmp_path / ID, "--episodes", 5, "--max-steps", 20, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert [score["column"] for score in found["scores"][:3]] == ["right", "up", "down"]
     assert found["steps"] <= 100
@@ -90,6 +88,5 @@ def test_the_command_and_its_errors(
         (["--episodes", "1"], "--episodes must be 2 or more, got 1"),
         ([], "a probe needs a ground truth, and MortarMayhem-Grid-v0 has none"),
     ):
-        monkeypatch.setattr(sys, "argv", ["endless-probe", str(tmp_path / "MortarMayhem-Grid-v0"), *changed])
-        assert probe.main() == 1
+        assert call(probe.main, tmp_path / "MortarMayhem-Grid-v0", *changed) == 1
         assert message in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -99,11 +100,10 @@ def test_sampled_actions_depend_only_on_the_seed(tmp_path: Path) -> None:
 
 
 def test_the_command_records_a_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     make("gru", tmp_path / "run")
-    monkeypatch.setattr(sys, "argv", ["endless-record", str(tmp_path / "run"), "--episodes", "3", "--json"])
-    assert recording.main() == 0
+    assert call(recording.main, tmp_path / "run", "--episodes", 3, "--json") == 0
     result = json.loads(capsys.readouterr().out)
     dataset = load(result["dataset"])
     assert len(dataset) == result["episodes"] == 3

@@ -2,7 +2,7 @@
 
 import json
 import re
-import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -235,14 +235,13 @@ def test_all_agents_are_tuned_with_the_same_common_choices(tmp_path: Path) -> No
 
 @pytest.mark.usefixtures("in_process")
 def test_a_track_of_your_own_is_tuned_resumed_and_extended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = written(tmp_path, tuning=TUNING | {"trials": 2})
 
     def run(*arguments: str) -> dict[str, Any]:
-        given = [str(file), "--jobs", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
-        monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given, *arguments])
-        assert leaderboard.main() == 0, capsys.readouterr().err
+        given = [file, "--jobs", 2, "--device", "cpu", "--out", tmp_path / "out"]
+        assert call(leaderboard.main, *given, *arguments) == 0, capsys.readouterr().err
         return dict(json.loads((tmp_path / "out/mine/results.json").read_text()))
 
     data = run()
@@ -294,13 +293,12 @@ def test_a_track_has_the_gap_to_fully_observable_twins(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_process")
-def test_an_agent_enters_a_track_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_enters_a_track_of_the_package(tmp_path: Path, call: Callable[..., int]) -> None:
     """In a smaller version, which has other budgets than the package's rows; the best agents are exported."""
     best, folder = tmp_path / "best", tmp_path / "out/scale-2e-05/million"
     given = f"million --seeds 1 --scale tiny --device cpu --out {tmp_path / 'out'} --best {best}"
     given += " --agents mingru none --tasks three-commands repeat-first-12"
-    monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given.split()])
-    assert leaderboard.main() == 0
+    assert call(leaderboard.main, *given.split()) == 0
     rows = json.loads((folder / "results.json").read_text())["rows"]
     assert [(row["agent"], row["task"], row["steps"] > 0) for row in rows] == [
         (agent, task, True) for agent in ("mingru", "none") for task in ("repeat-first-12", "three-commands")
@@ -323,7 +321,7 @@ def test_the_rows_of_the_package_have_equal_budgets() -> None:
 
 
 @pytest.mark.usefixtures("in_process")
-def test_the_page_from_idea_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_from_idea_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., int]) -> None:
     """With one update, and without the environment that the page builds."""
     text = (Path(__file__).parents[2] / "docs/train/from-idea-to-table.md").read_text()
     monkeypatch.chdir(tmp_path)
@@ -335,9 +333,8 @@ def test_the_page_from_idea_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyP
     track["tasks"] = [task for task in track["tasks"] if isinstance(task, str)]
     assert len(track["tasks"]) == 1
     Path("study.json").write_text(json.dumps(track))
-    given = ["study.json", "--scale", "tiny", "--agents", "none", "decay-fixed", "--seeds", "1", "2", "--device", "cpu"]
-    monkeypatch.setattr(sys, "argv", ["endless-leaderboard", *given])
-    assert leaderboard.main() == 0
+    given = "study.json --scale tiny --agents none decay-fixed --seeds 1 2 --device cpu"
+    assert call(leaderboard.main, *given.split()) == 0
     listed = re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|", text.split("## The table")[1].split("## Tuning")[0], re.M)
     named = {name for cell in listed for name in re.findall(r"`([\w.]+)`", cell)}
     assert {file.name for file in Path("leaderboard/scale-2e-05/study").iterdir()} == named

@@ -6,7 +6,7 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -164,15 +164,14 @@ def test_a_run_without_the_previous_action_stays_so(tmp_path: Path, monkeypatch:
     )
 
 
-def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_tools_read_a_run(tmp_path: Path, call: Callable[..., int]) -> None:
     run = new_run(tmp_path / "run", "--ppo.updates 3 --checkpoint-interval 1")
     ((found, files),) = protocol.find((tmp_path,), False)
     assert found == run and [file.stem for file in files] == [f"update-{update:06d}" for update in range(4)]
     loaded = checkpoint.load(run)
     assert (loaded.update, loaded.steps, loaded.settings.env) == (3, 3 * 8 * 16, "MortarMayhem-Grid-v0")
     assert len(evaluate(loaded.agent, range(200_000, 200_003), 1, num_threads=1)) == 3
-    monkeypatch.setattr(sys, "argv", ["endless-plot", str(run), "--out", str(tmp_path / "plots")])
-    assert plot.main() == 0 and any((tmp_path / "plots").glob("*.png"))
+    assert call(plot.main, run, "--out", tmp_path / "plots") == 0 and any((tmp_path / "plots").glob("*.png"))
     with pytest.raises(ValueError, match=rf"continue it with: endless learn --resume {run}, or .*--init-from"):
         train(parse(["--resume", str(run)]))
     (run / "checkpoints/last.safetensors").rename(run / "checkpoints/last.pt")
@@ -188,15 +187,17 @@ def test_the_python_tools_read_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("id", ["popgym-AutoencodeEasy-v0", "endless_gym:popgym-RepeatPreviousEasy-v0"])
 def test_a_run_in_an_environment_of_integers_is_recorded_and_exported(
-    id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    id: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    call: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     # Python imports the module before the `:`, which the program has.
     run, out = new_run(tmp_path / "run", "--ppo.updates 1", id), tmp_path / "agent.safetensors"
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    programs = [(record, ["--episodes", "3"]), (export, ["--out", str(out), "--vectors", str(tmp_path / "vectors")])]
-    for program, arguments in programs:
-        monkeypatch.setattr(sys, "argv", ["program", str(run), *arguments])
-        assert program.main() == 0
+    assert call(record.main, run, "--episodes", 3) == 0
+    assert call(export.main, run, "--out", out, "--vectors", tmp_path / "vectors") == 0
     printed = capsys.readouterr().out
     assert "\n3 episodes, " in f"\n{printed}" and "the page does not" in printed
     exported, trained = checkpoint.load(out), checkpoint.load(run)
@@ -205,15 +206,14 @@ def test_a_run_in_an_environment_of_integers_is_recorded_and_exported(
     assert [result["length"] for result in results[0]] == [result["length"] for result in results[1]]
 
 
-def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_of_either_program_start_a_run_of_the_other(tmp_path: Path, call: Callable[..., int]) -> None:
     run = new_run(tmp_path / "rust", "--ppo.updates 1")
     given = parse(f"--env {GRID} --preset quick {FLAGS} --threads 1 --ppo.updates 1".split())
     ours = train(replace(given, run=str(tmp_path / "python"), init_from=str(run)))
     started = checkpoint.load(ours / "checkpoints" / "update-000000.pt").agent.state_dict()
     assert all(torch.equal(weights, started[name]) for name, weights in checkpoint.load(run).agent.state_dict().items())
     file = tmp_path / "exported.safetensors"
-    monkeypatch.setattr(sys, "argv", ["export", str(ours), "--weights", str(file)])
-    assert export.main() == 0
+    assert call(export.main, ours, "--weights", file) == 0
     started = numbered(new_run(tmp_path / "next", f"--init-from {file} --ppo.updates 1"), 0).agent.state_dict()
     trained = checkpoint.load(ours).agent.state_dict()
     assert all(torch.equal(weights, started[name]) for name, weights in trained.items())

@@ -24,12 +24,6 @@ ESCAPED = r"\x1b]0;t\x07\x9b2J\n\r\u202e[/red]:smile:\udcff"
 Captured = pytest.CaptureFixture[str]
 
 
-def run(monkeypatch: pytest.MonkeyPatch, program: Callable[[], int], *arguments: str) -> int:
-    """The exit status of a program."""
-    monkeypatch.setattr("sys.argv", ["program", *arguments])
-    return program()
-
-
 def test_escapes_keep_the_text_of_all_languages() -> None:
     assert printable(HOSTILE) == ESCAPED
     plain = "Größe “5” 'x' \"y\" \\ 文字 🙂"
@@ -48,19 +42,17 @@ def test_a_console_escapes_texts_and_tables(width: int) -> None:
     assert written.splitlines()[-2:] == [r"\x1b]0;t\x07\x9b2J", r"\r\u202e[/red]:smile:\udcff"]
 
 
-def test_errors_of_hostile_names_take_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
-    assert run(monkeypatch, protocol.main, str(tmp_path / HOSTILE)) == 1
+def test_errors_of_hostile_names_take_one_line(tmp_path: Path, call: Callable[..., int], capsys: Captured) -> None:
+    assert call(protocol.main, tmp_path / HOSTILE) == 1
     said = capsys.readouterr().err
     assert r"\x1b]0;t\x07\x9b2J" in said and said.count("\n") == 1 and said.strip().isprintable()
 
 
 def test_a_run_in_a_folder_whose_name_is_not_utf_8_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+    tmp_path: Path, call: Callable[..., int], capsys: Captured
 ) -> None:
     folder = os.fsdecode(os.fsencode(tmp_path) + b"/\xff")
-    assert run(monkeypatch, train.main, "--env", "MysteryPath-Grid-v0", "--run", folder) == 1
+    assert call(train.main, "--env", "MysteryPath-Grid-v0", "--run", folder) == 1
     assert "the name of a run's folder must be UTF-8" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -78,10 +70,10 @@ def test_what_is_not_a_regular_file_is_refused_at_once(tmp_path: Path, name: str
 
 
 def test_settings_and_results_that_are_no_regular_files_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+    tmp_path: Path, call: Callable[..., int], capsys: Captured
 ) -> None:
     os.mkfifo(tmp_path / "settings.json")
-    assert run(monkeypatch, train.main, "--resume", str(tmp_path)) == 1
+    assert call(train.main, "--resume", tmp_path) == 1
     assert "settings.json is not a regular file" in capsys.readouterr().err
 
 
@@ -94,7 +86,7 @@ def test_a_million_empty_tensors_are_refused_at_once(tmp_path: Path) -> None:
         checkpoint.load(file)
 
 
-def test_an_export_prints_its_path_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured) -> None:
+def test_an_export_prints_its_path_escaped(tmp_path: Path, call: Callable[..., int], capsys: Captured) -> None:
     saved(tmp_path / "run", settings("gru", env="MysteryPath-Grid-v0"))
-    run(monkeypatch, export.main, str(tmp_path / "run"), "--out", str(tmp_path / "a\x1b[2Jb"))
+    call(export.main, tmp_path / "run", "--out", tmp_path / "a\x1b[2Jb")
     assert "\x1b" not in "".join(capsys.readouterr())
