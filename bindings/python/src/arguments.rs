@@ -21,42 +21,25 @@ use crate::errors;
 /// The required shape of actions: that of the action space, for a group with the environments as the first axis.
 pub struct ActionShape {
     shape: Vec<usize>,
-    meaning: &'static str,
+    meaning: String,
     /// Whether the numbers are float32, whose bits the engine receives.
     is_box: bool,
 }
 
 impl ActionShape {
-    /// The shape for one environment.
-    pub fn single(space: &ActionSpace) -> Self {
-        match space {
-            ActionSpace::Discrete(_) => ActionShape { shape: Vec::new(), meaning: "an integer", is_box: false },
-            ActionSpace::MultiDiscrete(branches) => {
-                ActionShape { shape: vec![branches.len()], meaning: "an integer for each branch", is_box: false }
-            }
-            ActionSpace::Box { low, .. } => {
-                ActionShape { shape: vec![low.len()], meaning: "a number for each dimension", is_box: true }
-            }
-        }
-    }
-
-    /// The shape for a group of environments.
-    pub fn group(space: &ActionSpace, num_envs: usize) -> Self {
-        match space {
-            ActionSpace::Discrete(_) => {
-                ActionShape { shape: vec![num_envs], meaning: "an integer for each environment", is_box: false }
-            }
-            ActionSpace::MultiDiscrete(branches) => ActionShape {
-                shape: vec![num_envs, branches.len()],
-                meaning: "an integer for each branch of each environment",
-                is_box: false,
-            },
-            ActionSpace::Box { low, .. } => ActionShape {
-                shape: vec![num_envs, low.len()],
-                meaning: "a number for each dimension of each environment",
-                is_box: true,
-            },
-        }
+    /// The shape for one environment, or for a group of `num_envs`.
+    pub fn new(space: &ActionSpace, num_envs: Option<usize>) -> Self {
+        let (width, one, is_box) = match space {
+            ActionSpace::Discrete(_) => (None, "an integer", false),
+            ActionSpace::MultiDiscrete(branches) => (Some(branches.len()), "an integer for each branch", false),
+            ActionSpace::Box { low, .. } => (Some(low.len()), "a number for each dimension", true),
+        };
+        let of = match (num_envs, width) {
+            (None, _) => "",
+            (Some(_), None) => " for each environment",
+            (Some(_), Some(_)) => " of each environment",
+        };
+        ActionShape { shape: num_envs.into_iter().chain(width).collect(), meaning: format!("{one}{of}"), is_box }
     }
 
     /// Copies the numbers of an array, or of a list of the same shape, into `to`, in C order. The engine checks their range.
@@ -133,7 +116,7 @@ impl ActionShape {
     }
 
     fn error(&self, given: &str) -> PyErr {
-        let (shape, meaning) = (shown(&self.shape), self.meaning);
+        let (shape, meaning) = (shown(&self.shape), &self.meaning);
         PyValueError::new_err(format!("actions must have the shape {shape}, {meaning}, got {given}"))
     }
 }

@@ -87,7 +87,7 @@ impl Connection {
         let trainer = wait_for_engine(py, timeout, connect)?;
         logs::flush(py)?;
         let specification = trainer.specification();
-        let action_shape = ActionShape::group(&specification.action_space, specification.num_envs);
+        let action_shape = ActionShape::new(&specification.action_space, Some(specification.num_envs));
         let kept = Kept::new(py, specification.groups)?;
         let group = |group| Group { trainer: Mutex::new(Some(group)), is_shared: AtomicBool::new(false) };
         Ok(Connection {

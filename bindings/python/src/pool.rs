@@ -88,7 +88,7 @@ impl Pools {
         let pools: Vec<Group> = configs.iter().map(group).collect::<PyResult<_>>()?;
         let first = &pools.first().ok_or_else(errors::closed)?.pool;
         Ok(Pools {
-            action_shape: ActionShape::group(&first.spec().action_space, first.layout().num_envs()),
+            action_shape: ActionShape::new(&first.spec().action_space, Some(first.layout().num_envs())),
             groups: pools.len(),
             kept: Kept::new(py, pools.len())?,
             state: Mutex::new(State { pools, pending: Vec::new() }),

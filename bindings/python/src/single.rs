@@ -33,7 +33,7 @@ impl Single {
         let threads = Threads::new(1).map_err(errors::pool)?;
         let pool = Pool::new(environments(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
         let blocks = zeroed(pool.layout().blocks());
-        let action_shape = ActionShape::single(&pool.spec().action_space);
+        let action_shape = ActionShape::new(&pool.spec().action_space, None);
         Ok(Single { pool, blocks, action_shape, action: Vec::new() })
     }
 
