@@ -42,39 +42,6 @@ def flat(value: Any) -> list[float]:
     return [number.item() for number in np.ravel(value)]
 
 
-def action(env: gymnasium.Env[Any, Any], numbers: list[float]) -> Any:
-    space = env.action_space
-    return int(numbers[0]) if isinstance(space, gymnasium.spaces.Discrete) else np.array(numbers, space.dtype)
-
-
-def test_spaces_are_the_originals() -> None:
-    expected = recorded("spaces")
-    assert set(IDS) == set(expected)
-    for id, texts in expected.items():
-        env = gymnasium.make(f"EndlessGym/{id}")
-        assert [str(env.action_space), str(env.observation_space)] == texts
-        envs = gymnasium.make_vec(f"EndlessGym/{id}", num_envs=2)
-        assert [str(envs.single_action_space), str(envs.single_observation_space)] == texts
-        observation, _ = envs.reset(seed=1)
-        assert envs.observation_space.contains(observation), id
-        envs.close()
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_a_single_environment_plays_recorded_episodes(family: str) -> None:
-    for trace in recorded(family)[:2]:
-        env = gymnasium.make(f"EndlessGym/{trace['env']}")
-        for episode in trace["episodes"]:
-            observation, _ = env.reset(seed=episode["seed"], options=trace["options"])
-            assert env.observation_space.contains(observation)
-            assert flat(observation) == episode["observation"]
-            for numbers, expected, *end, _ in episode["steps"]:
-                observation, reward, terminated, truncated, info = env.step(action(env, numbers))
-                assert env.observation_space.contains(observation)
-                assert (flat(observation), [reward, terminated, truncated]) == (expected, end)
-            assert info["length"] == len(episode["steps"])
-
-
 def test_states_are_the_originals() -> None:
     expected = recorded("states")
     assert set(expected) == {*IDS, *ARGUMENTS}

@@ -94,12 +94,6 @@ def trace(env_id: str, seed: int, episodes: int, options: dict[str, float]) -> d
     }
 
 
-def spaces() -> dict[str, list[str]]:
-    """The action space and the observation space of each id, as text."""
-    made = {env_id: gymnasium.make(env_id, disable_env_checker=True) for env_id in IDS}
-    return {env_id: [str(env.action_space), str(env.observation_space)] for env_id, env in made.items()}
-
-
 def wrapped(env_id: str, seed: int) -> dict[str, Any]:
     """Random steps with POPGym's wrappers. A step after the end of an episode starts the next, as in a vector environment."""
     original, picker = Original(env_id), random.Random(seed)

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from original import IDS, spaces, trace, wrapped
+from original import IDS, trace, wrapped
 
 SEED = 20230501
 
@@ -43,7 +43,7 @@ def main() -> None:
             answer = trace(request["env"], request["seed"], request["episodes"], request["options"])
             print(json.dumps(answer), flush=True)
         return
-    files: dict[str, Any] = {**record(), "spaces": spaces(), "wrapped": {id: wrapped(id, SEED) for id in WRAPPED}}
+    files: dict[str, Any] = {**record(), "wrapped": {id: wrapped(id, SEED) for id in WRAPPED}}
     for name, content in files.items():
         text = json.dumps(content, separators=(",", ":"))
         path = Path(sys.argv[1]) / f"{name}.json.gz"
