@@ -10,6 +10,7 @@ import copy
 import inspect
 import json
 from enum import IntEnum
+from functools import partial
 from itertools import compress
 from typing import Any
 
@@ -225,28 +226,16 @@ def DiscreteAction(envs: Envs) -> Any:  # noqa: N802 - POPGym's class
         return envs
     if not isinstance(space, spaces.MultiDiscrete):
         raise ValueError(f"the action space must be Discrete or MultiDiscrete, got {space}")
-    return (_DiscreteActions if isinstance(envs, VectorEnv) else _DiscreteAction)(envs, space)
+    choices, flat = tuple(space.nvec.tolist()), spaces.Discrete(int(space.nvec.prod()))
+    split = partial(_branches, choices)
+    if isinstance(envs, VectorEnv):
+        return gymnasium.wrappers.vector.TransformAction(envs, split, single_action_space=flat)
+    return gymnasium.wrappers.TransformAction(envs, split, flat)
 
 
-class _DiscreteAction(gymnasium.ActionWrapper[Any, Any, Any]):
-    def __init__(self, env: gymnasium.Env[Any, Any], space: spaces.MultiDiscrete) -> None:
-        super().__init__(env)
-        self._choices = tuple(space.nvec.tolist())
-        self.action_space = spaces.Discrete(int(space.nvec.prod()))
-
-    def action(self, action: Any) -> NDArray[np.int64]:
-        return np.array(np.unravel_index(action, self._choices))
-
-
-class _DiscreteActions(VectorWrapper):
-    def __init__(self, envs: VectorEnv[Any, Any, Any], space: spaces.MultiDiscrete) -> None:
-        super().__init__(envs)
-        self._choices = tuple(space.nvec.tolist())
-        self.single_action_space = spaces.Discrete(int(space.nvec.prod()))
-        self.action_space = batch_space(self.single_action_space, envs.num_envs)
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        return self.env.step(np.stack(np.unravel_index(actions, self._choices), axis=1))
+def _branches(choices: tuple[int, ...], actions: Any) -> NDArray[np.int64]:
+    """The choice of each branch, in the last axis."""
+    return np.stack(np.unravel_index(actions, choices), axis=-1)
 
 
 class Observability(IntEnum):
