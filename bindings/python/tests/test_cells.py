@@ -8,13 +8,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import pickle
 import re
 import subprocess
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from original_types import types
@@ -138,35 +136,6 @@ def test_torchrl_plays_all_of_popgym() -> None:
             assert data["observation"].shape[0] == 2
         if "Tuple" not in str(envs.single_observation_space):
             assert EndlessEnv.make(id, 2).rollout(3)["observation"].shape[0] == 2
-
-
-@pytest.mark.libraries
-@pytest.mark.parametrize("id", [id for id in POPGYM if "Easy" in id])
-def test_the_wrappers_of_popgym_take_single_environments(id: str) -> None:
-    wrappers = pytest.importorskip("popgym.wrappers")
-    from popgym.core.observability import Observability
-
-    env = gymnasium.make(f"EndlessGym/{id}")
-    wrapped = wrappers.Flatten(wrappers.Antialias(wrappers.PreviousAction(env)))
-    if not isinstance(env.action_space, gymnasium.spaces.Box):
-        wrapped = wrappers.DiscreteAction(wrapped)
-    vectors = PreviousAction(endless_gym.make_vec(id, 1), flatten=True)
-    single, (batch, _) = wrapped.reset(seed=1)[0], vectors.reset(seed=1)
-    np.testing.assert_array_equal(single, batch[0])
-    wrapped.action_space.seed(1)
-    for _ in range(20):
-        action = wrapped.action_space.sample()
-        given = action
-        if isinstance(env.action_space, gymnasium.spaces.MultiDiscrete):
-            given = np.array(np.unravel_index(action, env.action_space.nvec))
-        (single, _, terminated, truncated, _), (batch, *_) = wrapped.step(action), vectors.step(np.asarray(given)[None])
-        np.testing.assert_array_equal(single, batch[0])
-        if terminated or truncated:
-            break
-    assert env.obs_requires_prev_action == any(name in id for name in ("Band", "Battle", "Conc", "Mine", "Lab"))
-    markovian = wrappers.Markovian(env, Observability.FULL)
-    assert markovian.observation_space.contains(markovian.reset(seed=1)[0])
-    assert pickle.loads(pickle.dumps(env)).obs_requires_prev_action == env.obs_requires_prev_action
 
 
 @pytest.mark.parametrize(
