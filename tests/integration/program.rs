@@ -37,6 +37,8 @@ fn list_shows_environments_and_parameters() {
         text(&unknown.stderr).starts_with("endless: no environment `MortarMayhem-v1`; did you mean MortarMayhem-v0?")
     );
     assert_eq!(text(&unknown.stderr).lines().count(), 1);
+    let prefixed = place.run(&["list", "EndlessGym/MysteryPath-v0"]);
+    assert!(prefixed.status.success(), "{}", text(&prefixed.stderr));
 }
 
 /// Runs a program in a terminal with this number of columns, and returns its standard output.
@@ -398,6 +400,11 @@ fn page_says_what_a_crate_or_cargo_lacks() {
         assert!(text(&refused.stderr).contains(part), "{}", text(&refused.stderr));
         assert!(!place.root().join("site").exists());
     }
+    // Cargo, which started this test, names its crate.
+    let elsewhere =
+        place.endless(&["page"]).env_remove("CARGO_MANIFEST_DIR").current_dir(place.root()).output().unwrap();
+    assert_eq!(elsewhere.status.code(), Some(1));
+    assert!(text(&elsewhere.stderr).contains("there is none in "), "{}", text(&elsewhere.stderr));
 }
 
 #[test]

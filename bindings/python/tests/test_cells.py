@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ from support import same
 
 import endless_gym
 from endless_gym.popgym import PreviousAction
-from endless_gym.program import program
 
 #: An environment of each suite and of each kind of observation and action space.
 IDS = [
@@ -167,29 +164,3 @@ def test_environments_have_pictures_or_text(id: str, where: str) -> None:
         else:
             assert re.fullmatch(r"\S+ \S+(  \S+ \S+)*", shown)
             assert ("spades" in shown or "hearts" in shown) or "Repeat" not in id
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("list EndlessGym/MysteryPath-v0", ""),
-        (
-            "list mysterypath",
-            "endless: no environment `mysterypath`; did you mean MysteryPath-v0? `endless list` shows all\n",
-        ),
-        (
-            "list popgym-RepeatPrevious",
-            "did you mean popgym-RepeatPreviousEasy-v0, popgym-RepeatPreviousMedium-v0 or popgym-",
-        ),
-        ("list popgym", "did you mean one of 48 such ids? `endless list` shows all"),
-        ("list RepeatFirstEasy", "did you mean popgym-RepeatFirstEasy-v0?"),
-        ("list xyz", "no environment `xyz`; there are MortarMayhem-v0, "),
-        ("page", "the page shows the environments of a crate, and there is none in "),
-    ],
-)
-def test_the_program_says_what_to_do(arguments: str, message: str, tmp_path: Path) -> None:
-    # Cargo, which may have started these tests, names its crate.
-    env = {name: value for name, value in os.environ.items() if not name.startswith("CARGO_MANIFEST")}
-    command = [*program(), *arguments.split()]
-    ran = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
-    assert message in ran.stderr and bool(ran.stderr) == bool(message) == bool(ran.returncode)
