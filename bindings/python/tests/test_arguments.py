@@ -169,30 +169,6 @@ def test_arguments_of_other_types_are_refused(where) -> None:
             make()
 
 
-MISTAKES = {
-    "id": {"id": "Mortar"},
-    "num_envs": {"num_envs": 2**63, "groups": 4},
-    "groups": {"groups": 65},
-    "num_threads": {"num_threads": 100_000},
-    "seeds beyond 2^63": {"seeds": range(2**64 - 2, 2**64)},
-    "option out of range": {"options": {"arena_size": 99}},
-    "one option of several": {"num_envs": 2, "groups": 2, "options": [{}, {}, {}, {"arena_size": 99}]},
-    "too few options": {"num_envs": 2, "groups": 2, "options": [{}, {}, {}]},
-    "stack": {"frames": endless_gym.Frames(stack=65)},
-    "frames": {"observation": "features", "frames": endless_gym.Frames()},
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_raise_the_same_errors_in_an_engine_process(mistake: str) -> None:
-    errors = []
-    for where in WHERE:
-        with pytest.raises(ValueError) as refused:
-            where(**{"id": ID, **MISTAKES[mistake]})
-        errors.append((type(refused.value), str(refused.value)))
-    assert errors[0] == errors[1]
-
-
 def test_batches_held_are_checked() -> None:
     for given in (0, 17):
         with pytest.raises(ValueError, match=f"^batches_held must be 1 to 16, got {given}$"):
