@@ -138,6 +138,8 @@ threading.Thread(target=lambda envs: threading.Event().wait(), args=[envs], daem
 def test_close_ends_the_engine_while_a_forked_child_lives() -> None:
     envs = endless_gym.serve(ID, 4)
     envs.reset()
+    with pytest.raises(ConnectionError, match="already has a trainer"):
+        endless_gym.connect(envs._engine.service, timeout=1)
     child = os.fork()
     if child == 0:
         signal.pause()
