@@ -18,26 +18,6 @@ ID = "Endless-MortarMayhem-v0"
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("id", [ID, "MortarMayhemB-Grid-v0", "Endless-SearingSpotlights-v0"])
-def test_vector_env_plays_as_sync_vector_env(where, mode: AutoresetMode, id: str) -> None:
-    sync = SyncVectorEnv([lambda: endless_gym.Env(id) for _ in range(4)], autoreset_mode=mode)
-    with where(id, 4, autoreset=mode) as envs:
-        assert envs.metadata["autoreset_mode"] is mode
-        assert envs.single_observation_space == sync.single_observation_space
-        assert envs.action_space == sync.action_space
-        envs.action_space.seed(1)
-        same(envs.reset(seed=5), sync.reset(seed=5))
-        ends = 0
-        for _ in range(300):
-            actions = envs.action_space.sample()
-            step, wanted = envs.step(actions), sync.step(actions)
-            ends += int(step[2].sum())
-            same(step, wanted)
-        assert ends > 0
-
-
-@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("elsewhere", WHERE)
 def test_snapshots_continue_identically_in_process_and_served(where, elsewhere) -> None:
     with where(ID, 3, groups=2) as envs, elsewhere(ID, 3, groups=2, seed=8) as others:

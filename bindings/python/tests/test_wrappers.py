@@ -91,7 +91,10 @@ def pair(request: pytest.FixtureRequest) -> Iterator[tuple[VectorEnv, VectorEnv]
     ones."""
     where, mode, id = request.param
     with WHERE[where](id, NUM_ENVS, autoreset=mode, options=SHORT[id], render_mode="rgb_array") as envs:
-        yield envs, synchronous(id, mode)
+        sync = synchronous(id, mode)
+        assert envs.single_observation_space == sync.single_observation_space
+        assert envs.action_space == sync.action_space
+        yield envs, sync
 
 
 def synchronous(id: str, mode: AutoresetMode) -> VectorEnv:
