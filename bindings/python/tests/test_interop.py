@@ -287,16 +287,3 @@ def test_from_dlpack_takes_the_arrays_themselves(where) -> None:
             assert same.ctypes.data == array.ctypes.data
             assert same.flags.writeable == array.flags.writeable
             assert torch.from_dlpack(array).data_ptr() == array.ctypes.data
-
-
-@pytest.mark.parametrize("where", WHERE)
-def test_actions_that_numpy_cannot_read_are_refused_with_its_reason(where) -> None:
-    zeros = torch.zeros(4)
-    tensors = [zeros.to("meta"), zeros.requires_grad_(), torch.zeros(4, dtype=torch.int64).to_sparse()]
-    with where("MortarMayhem-Grid-v0", 4, seed=1) as envs:
-        envs.reset()
-        for actions in tensors:
-            with pytest.raises(TypeError, match=r"got Tensor: .*; pass `actions\.detach\(\)\.cpu\(\)`") as raised:
-                envs.step(actions)
-            assert raised.value.__cause__ is not None
-        envs.step(torch.zeros(4, dtype=torch.int64))
