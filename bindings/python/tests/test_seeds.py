@@ -30,14 +30,3 @@ def test_ranges_keep_their_step(where) -> None:
     for seeds in (range(0, 10, 3), range(9, -1, -3)):
         with where(ID, 64, seeds=seeds, seed=1) as envs:
             assert {frame.tobytes() for frame in envs.reset()[0]} == wanted
-
-
-@pytest.mark.parametrize("where", WHERE)
-def test_lists_longer_than_a_command_line_are_used_in_order(where) -> None:
-    """The list is longer than the longest permitted command-line argument."""
-    seeds = [(number * 7_919) % 2**64 + 10**15 for number in range(100_000)]
-    with where(ID, 3, seeds=seeds) as envs:
-        for episode in range(2):
-            for env, frame in enumerate(envs.reset()[0]):
-                expected, _ = endless_gym.Env(ID).reset(seed=seeds[3 * episode + env])
-                np.testing.assert_array_equal(frame, expected)
