@@ -35,6 +35,8 @@ def test_a_timeout_is_a_number_of_seconds() -> None:
         endless_gym.connect("nobody", timeout="soon")
     with pytest.raises(ConnectionError, match="nobody"):
         endless_gym.connect("nobody", timeout=0)
+    with pytest.raises(ValueError, match="letters"):
+        endless_gym.connect("a/b", timeout=0)
 
 
 @pytest.mark.parametrize("where", WHERE)

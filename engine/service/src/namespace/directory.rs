@@ -208,7 +208,7 @@ mod tests {
     #[test]
     fn engine_names_are_checked() {
         check_name("mortar_mayhem-1.0").unwrap();
-        for name in ["", "a/b", "a b", &"a".repeat(65)] {
+        for name in ["", "a/b", "a b", "g\u{443}m", "gym\n", &"a".repeat(65)] {
             assert!(matches!(check_name(name), Err(ServiceError::InvalidName { .. })), "{name}");
         }
     }
