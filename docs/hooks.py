@@ -18,7 +18,6 @@ ROOT = Path(__file__).parent.parent
 PAGES = {
     "design/comparison.md": "benches/comparison.md",
     "reference/changes.md": "CHANGELOG.md",
-    "train/learning.md": "agents/benches/learning/README.md",
     "train/leaderboard.md": "agents/benches/leaderboard/million/README.md",
     "train/ablations/index.md": "agents/benches/leaderboard/ablations/README.md",
     "train/hour.md": "agents/benches/hour/README.md",

@@ -63,13 +63,6 @@ GROUPS = {
     },
 }
 
-#: Agents of the learning curve.
-AGENTS = {"gru": "GRU", "trxl": "Transformer-XL", "none": "without memory"}
-#: Window of the moving average, in updates.
-SMOOTH = 24
-#: Points of a curve in the chart of all tasks.
-POINTS = 120
-
 
 def chart(folder: Path, name: str, height: float, draw: Callable[[Figure, Theme], None]) -> None:
     """Write both variants of a chart as SVG, without a date, so that the same data gives the same files."""
@@ -177,79 +170,6 @@ def comparison(folder: Path, report: Path) -> None:
     chart(folder, "steps-per-second", 3.4, draw)
 
 
-def smooth(values: np.ndarray, window: int) -> np.ndarray:
-    """Moving average over up to `window` values."""
-    sums, sizes = (np.convolve(each, np.ones(window), "same") for each in (values, np.ones_like(values)))
-    return sums / sizes
-
-
-def learning(folder: Path, results: Path) -> None:
-    """Learning curves of agents with and without memory, from a file of `agents/benches/learning.py`."""
-    data = json.loads(results.read_text())
-
-    def draw(figure: Figure, theme: Theme) -> None:
-        axes = figure.add_axes((0.062, 0.14, 0.77, 0.66))
-        plain(axes)
-        axes.set(xlim=(0, max(run["steps"] for run in data["runs"]) / 1e6), ylim=(0, 1.02))
-        axes.set_xlabel("million environment steps", fontsize=SMALL)
-        axes.set_yticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
-        axes.tick_params(axis="y", colors=theme.faint)
-        axes.grid(axis="y", lw=1)
-        for agent, name in AGENTS.items():
-            colour, ends = theme.agents[agent], []
-            for run in (run for run in data["runs"] if run["agent"] == agent):
-                steps, rewards = np.array(run["curve"]).T
-                share = smooth(rewards / data["best_reward"], SMOOTH)
-                shown = np.append(np.arange(0, len(steps) - 1, SMOOTH // 4), len(steps) - 1)
-                axes.plot(steps[shown] / 1e6, share[shown], color=colour, lw=1.6, solid_capstyle="round")
-                ends.append((steps[-1] / 1e6, share[-1]))
-            axes.plot(*zip(*ends, strict=True), "o", color=colour, ms=5, mec="none", clip_on=False)
-            style = {"textcoords": "offset points", "va": "center", "color": colour, "annotation_clip": False}
-            axes.annotate(name, max(ends), (9, 0), **style)
-        note = "Share of the best possible reward during training, three commands of MortarMayhem-Grid; a line for each run."
-        header(figure, theme, "With and without memory", note)
-
-    chart(folder, "learning", 3.1, draw)
-
-
-def panels(figure: Figure, theme: Theme, titles: list[str], agents: dict[str, tuple[str, float]]) -> list[Axes]:
-    """Axes with these titles in two columns, and the names of agents, each at a distance from the right edge, above them."""
-    axes = list(figure.subplots(-(-len(titles) // 2), 2, squeeze=False).flat)
-    for unused in axes[len(titles) :]:
-        unused.set_axis_off()
-    for each, title in zip(axes, titles, strict=False):
-        plain(each)
-        each.set_title(title, loc="left", fontsize=BODY)
-        each.tick_params(colors=theme.faint)
-        each.grid(axis="y", lw=1)
-    for agent, (name, distance) in agents.items():
-        style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
-        figure.text(0.985 - distance, 1 - 0.2 / figure.get_figheight(), name, **style)
-    return axes[: len(titles)]
-
-
-def tasks(folder: Path) -> None:
-    """Learning curves of all tasks of `agents/benches/learning.py`, from the files in its folder and into it."""
-    found = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
-
-    def draw(figure: Figure, theme: Theme) -> None:
-        agents = {agent: (AGENTS[agent], distance) for agent, distance in zip(AGENTS, (0, 0.06, 0.19), strict=True)}
-        for axes, data in zip(panels(figure, theme, [data["task"] for data in found], agents), found, strict=True):
-            if data["best_reward"]:
-                axes.axhline(data["best_reward"], color=theme.faint, lw=0.8, ls="--")
-            for run in data["runs"]:
-                steps, rewards = np.array(run["curve"]).T
-                shown = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
-                window = max(1, len(steps) // POINTS)
-                axes.plot(steps[shown] / 1e6, smooth(rewards, window)[shown], color=theme.agents[run["agent"]], lw=1.2)
-            axes.set_ylim(bottom=0)
-        figure.subplots_adjust(0.06, 0.04, 0.985, 0.91, wspace=0.13, hspace=0.42)
-        note = "Mean reward of 100 episodes by million environment steps; dashed: the best possible."
-        header(figure, theme, "Learning", note)
-
-    chart(folder, "curves", 1.9 * -(-len(found) // 2) + 0.6, draw)
-
-
 def hour(folder: Path) -> None:
     """Curves of the runs of `agents/benches/hour.py`, from the files in its folder and into it."""
     environments: dict[str, list[dict[str, Any]]] = {}
@@ -258,16 +178,22 @@ def hour(folder: Path) -> None:
         environments.setdefault(data["env"], []).append(data)
 
     def draw(figure: Figure, theme: Theme) -> None:
-        titles = [f"{env}, {own[0]['metric'].replace('_', ' ')}" for env, own in environments.items()]
-        agents = {agent: (agent, place * 0.07) for place, agent in enumerate(("gru", "mingru", "trxl"))}
-        for axes, own in zip(panels(figure, theme, titles, agents), environments.values(), strict=True):
+        height = figure.get_figheight()
+        for place, agent in enumerate(("gru", "mingru", "trxl")):
+            style = {"fontsize": SMALL, "weight": "bold", "color": theme.agents[agent], "ha": "right"}
+            figure.text(0.985 - place * 0.07, 1 - 0.2 / height, agent, **style)
+        panels = figure.subplots(-(-len(environments) // 2), 2, squeeze=False).flat
+        for axes, (env, own) in zip(panels, environments.items(), strict=False):
+            plain(axes)
+            axes.set_title(f"{env}, {own[0]['metric'].replace('_', ' ')}", loc="left", fontsize=BODY)
+            axes.tick_params(colors=theme.faint)
+            axes.grid(axis="y", lw=1)
             for agent, score in own[0]["paper"].items():
                 axes.axhline(score, color=theme.agents[agent], lw=0.8, ls="--")
             for agent, run in ((data["agent"], run) for data in own for run in data["runs"]):
                 minutes, _, values = np.array(run["curve"]).T
                 axes.plot(minutes, values, color=theme.agents[agent], lw=1.2)
             axes.set(xlim=(0, None), ylim=(0, None))
-        height = figure.get_figheight()
         figure.subplots_adjust(0.06, 0.3 / height, 0.985, 1 - 0.95 / height, wspace=0.13, hspace=0.5)
         note = "Evaluation over minutes of training on one core; dashed: the end of the paper's training, from frames."
         header(figure, theme, "An hour on one core", note)

@@ -1,9 +1,8 @@
-"""Makes the pictures of the documentation in `docs/images`, and those of the learning curves: `cargo xtask pictures` installs the
+"""Makes the pictures of the documentation in `docs/images`, and that of the learning curves: `cargo xtask pictures` installs the
 packages and runs this script.
 
 The animations are episodes of the scripted experts with fixed seeds. The charts show `benches/comparison.md` and the results of
-`agents/benches/learning.py` and `hour.py`; measure or train again to change them. The same versions give the
-same bytes.
+`agents/benches/hour.py`; measure or train again to change them. The same versions give the same bytes.
 """
 
 from pathlib import Path
@@ -13,7 +12,6 @@ import films
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs/images"
-LEARNING = ROOT / "agents/benches/learning"
 HOUR = ROOT / "agents/benches/hour"
 
 
@@ -21,8 +19,6 @@ def main() -> None:
     """Make all pictures."""
     (IMAGES / "environments").mkdir(parents=True, exist_ok=True)
     charts.comparison(IMAGES, ROOT / "benches/comparison.md")
-    charts.learning(IMAGES, LEARNING / "three-commands.json")
-    charts.tasks(LEARNING)
     charts.hour(HOUR)
     films.overview(IMAGES / "environments.webp")
     for scene in films.SCENES:
