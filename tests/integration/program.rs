@@ -83,27 +83,6 @@ fn list_shows_pictures_in_terminals_with_colours() {
 }
 
 #[test]
-fn frames_are_those_of_an_episode() {
-    let place = Place::new();
-    let frames = |steps: &str| place.run(&["frames", "--env", "MysteryPath-Grid-v0", "--seed", "1", "--steps", steps]);
-    let bytes = 84 * 84 * 3 + 336 * 336 * 3;
-    let whole = frames("1000").stdout;
-    assert_eq!(whole.len(), 19 * bytes); // the expert needs 18 steps
-    assert_eq!(frames("3").stdout, whole[..4 * bytes]);
-    let (observation, view) = whole[..bytes].split_at(84 * 84 * 3);
-    let pixel = |frame: &[u8], side: usize, row: usize, column: usize| frame[(row * side + column) * 3..][..3].to_vec();
-    // The path leads along the sixth of seven rows.
-    assert_eq!(pixel(view, 336, 260, 100), [255; 3]);
-    assert_ne!(pixel(view, 336, 100, 260), [255; 3]);
-    // The agent is at the same place as in the view.
-    let skin: Vec<usize> = (0..84 * 84).filter(|place| observation[place * 3..][..3] == [250, 204, 153]).collect();
-    assert!(!skin.is_empty());
-    for place in skin {
-        assert_eq!(pixel(view, 336, place / 84 * 4, place % 84 * 4), [250, 204, 153]);
-    }
-}
-
-#[test]
 fn verify_counts_differences_and_exits_with_1_if_there_are_any() {
     let place = Place::new();
     let files = traces("MortarMayhem-Grid-v0");

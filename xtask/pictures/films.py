@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +11,7 @@ from typing import NamedTuple
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 from endless_gym.program import program
 from endless_gym.specs import all_specs
@@ -18,8 +19,7 @@ from endless_gym.specs import all_specs
 #: An image or a film, uint8 (frames, height, width, 3) or without the first axis.
 Pixels = NDArray[np.uint8]
 
-SCREEN, VIEW = 84, 336
-_FRAME_BYTES = [SCREEN * SCREEN * 3, VIEW * VIEW * 3]
+SCREEN = 84
 _FONTS = Path(matplotlib.get_data_path()) / "fonts/ttf"
 
 #: Colours of the panel behind the frames and of its text.
@@ -80,13 +80,14 @@ _FADE = (0.7, 0.4, 0.15)
 
 def film(id: str, seed: int, steps: int, options: tuple[str, ...] = ()) -> Film:
     """Play an episode, at most `steps` steps."""
-    command = [*program(), "frames", f"--env={id}", f"--seed={seed}", f"--steps={steps}"]
-    command += [f"--option={given}" for given in options]
-    raw = np.frombuffer(subprocess.check_output(command), np.uint8).reshape(-1, sum(_FRAME_BYTES))
-    observation, view = np.split(raw, _FRAME_BYTES[:1], axis=1)
-    scale = VIEW // SCREEN  # the view repeats each pixel
-    view = view.reshape(-1, VIEW, VIEW, 3)[:, ::scale, ::scale]
-    return Film(observation.reshape(-1, SCREEN, SCREEN, 3), view)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "film.webp"
+        command = [*program(), "record", id, f"--film={file}", f"--seed={seed}", f"--max-steps={steps}", "--scale=1"]
+        command += [f"--option={given}" for given in options]
+        subprocess.check_call(command, stdout=subprocess.DEVNULL)
+        with Image.open(file) as pictures:
+            both = np.stack([np.asarray(each.convert("RGB")) for each in ImageSequence.Iterator(pictures)])
+    return Film(both[:, :, :SCREEN], both[:, :, -SCREEN:])
 
 
 def magnify(pixels: Pixels, scale: int) -> Pixels:

@@ -26,9 +26,7 @@ use nix::sys::signal::{SigSet, Signal};
 
 pub use film::file as film_file;
 
-use commands::{
-    bench, check, demo, frames, learn, list, new, page, play, record, scaling, serve, status, verify, view,
-};
+use commands::{bench, check, demo, learn, list, new, page, play, record, scaling, serve, status, verify, view};
 use failure::Failure;
 
 /// Environments for reinforcement learning in lockstep, in process and in shared memory.
@@ -83,9 +81,6 @@ enum Command {
     /// Remove what dead processes left in the namespace. The status is that of a failure, as the process was one that failed.
     #[command(hide = true)]
     Clean,
-    /// Write the raw frames of an expert's episode to standard output.
-    #[command(hide = true)]
-    Frames(frames::Args),
 }
 
 /// Exit status of a command that failed or found differences.
@@ -186,7 +181,6 @@ fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
         Command::Learn(settings) => learn::run(registry, &settings)?,
         Command::New(args) => new::run(registry, &args)?,
         Command::Page(args) => page::run(registry, &args)?,
-        Command::Frames(args) => frames::run(registry, &args)?,
         Command::Clean => return Ok(endless_gym_service::running_engines(&Namespace::default()).is_err()),
         Command::Verify(args) => return verify::run(registry, &args),
         Command::Check(args) => return check::run(registry, &args),

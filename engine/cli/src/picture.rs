@@ -57,7 +57,7 @@ const TYPICAL_STEP: usize = 12;
 pub fn picture(registry: &Registry, spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
     let config = PoolConfig::new(spec.id, 1).seeding(Seeding::Continue { seed: Some(SEED) });
     let policy = if registry.expert(spec.id).is_ok() { Policy::Expert } else { Policy::Random };
-    let mut film = Film::played_by(registry, &config, policy, 0)?;
+    let mut film = Film::new(registry, &config, policy, 0)?;
     for _ in 0..TYPICAL_STEP {
         film.step()?;
     }

@@ -3,7 +3,6 @@
 pub mod bench;
 pub mod check;
 pub mod demo;
-pub mod frames;
 pub mod learn;
 pub mod list;
 pub mod new;

@@ -89,7 +89,7 @@ impl FilmArgs {
         let config = PoolConfig::new(&self.id, 1)
             .options(ResetOptions::Shared(parameters(&self.options)?))
             .seeding(Seeding::Continue { seed: Some(self.seed.wrapping_add(episode)) });
-        Film::played_by(registry, &config, self.policy, self.action_seed.wrapping_add(episode))
+        Film::new(registry, &config, self.policy, self.action_seed.wrapping_add(episode))
     }
 }
 

@@ -26,18 +26,8 @@ pub struct Film {
 }
 
 impl Film {
-    /// Starts the first episode of the environment that `config` describes, played by its scripted expert.
-    pub fn new(registry: &Registry, config: &PoolConfig) -> Result<Self, Failure> {
-        Film::played_by(registry, config, Policy::Expert, 0)
-    }
-
-    /// Like [`new`](Film::new), with another policy. `action_seed` seeds the random actions.
-    pub fn played_by(
-        registry: &Registry,
-        config: &PoolConfig,
-        policy: Policy,
-        action_seed: u64,
-    ) -> Result<Self, Failure> {
+    /// Starts the first episode of the environment that `config` describes. `action_seed` seeds the random actions.
+    pub fn new(registry: &Registry, config: &PoolConfig, policy: Policy, action_seed: u64) -> Result<Self, Failure> {
         let config = config.clone().num_envs(1).total_envs(1).features(true).frames(None);
         let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
