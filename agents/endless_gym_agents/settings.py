@@ -6,7 +6,6 @@ follow the hyperparameter table of the paper where possible.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import difflib
 import json
@@ -34,8 +33,8 @@ TRAINING_SEEDS = range(100_000)
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
 
-#: The wrapper in environments whose observations are not vectors, that of runs of `endless learn` whose settings have none, and
-#: that of fully observable twins.
+#: The wrapper in environments whose observations are not vectors, that without the previous action, and that of fully observable
+#: twins.
 VECTORS, ONE_HOT, STATES = (f"endless_gym_agents.popgym:{name}" for name in ("Vectors", "OneHot", "States"))
 
 #: An example for each setting that lists items NAME=VALUE.
@@ -97,12 +96,12 @@ class Environment:
         """The wrappers that change more than the form of observations: your own, and that of fully observable twins."""
         return tuple(wrapper for wrapper in self.wrapper if wrapper not in (VECTORS, ONE_HOT))
 
-    def fitted(self, described: Spec, vectors: str = VECTORS) -> Environment:
-        """These settings with features if there are no frames, and with the wrapper `vectors` if there is none for integers."""
+    def fitted(self, described: Spec) -> Environment:
+        """These settings with features if there are no frames, and with `Vectors` if there is no wrapper for integers."""
         observation: Literal["rgb", "features"] = self.observation if described.frame else "features"
         space = described.observation_space(Frames() if observation == "rgb" else None, observation == "features")
         is_fitting = self.wrapper or isinstance(space, spaces.Box | spaces.Dict)
-        wrapper = self.wrapper if is_fitting else (vectors,)
+        wrapper = self.wrapper if is_fitting else (VECTORS,)
         return dataclasses.replace(self, observation=observation, wrapper=wrapper)
 
 
@@ -521,9 +520,7 @@ def from_dict(values: dict[str, Any]) -> Settings:
             values[part.name] = kind(**values.get(part.name, {}))
     # JSON has lists for tuples.
     environment = values["environment"]
-    environment = dataclasses.replace(environment, option=tuple(environment.option), wrapper=tuple(environment.wrapper))
-    # An unknown id is reported where its environments are made.
-    with contextlib.suppress(TypeError, ValueError):
-        environment = environment.fitted(spec(values.get("env", DEFAULT_ENV_ID)), ONE_HOT)
-    values["environment"] = environment
+    values["environment"] = dataclasses.replace(
+        environment, option=tuple(environment.option), wrapper=tuple(environment.wrapper)
+    )
     return Settings(**values | {name: tuple(values.get(name, ())) for name in ("agent_option", "encoder_option")})

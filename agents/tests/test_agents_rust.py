@@ -15,7 +15,6 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional
@@ -140,21 +139,11 @@ def test_both_trainers_observe_the_same_vectors(env: str, tmp_path: Path, monkey
     assert update == 2 and ends >= 8
 
 
-def test_a_run_without_the_previous_action_stays_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run of an earlier version, whose settings have no wrapper."""
+def test_a_run_without_the_previous_action_stays_so(tmp_path: Path) -> None:
     run = new_run(tmp_path / "run", f"--environment.wrapper {ONE_HOT} --ppo.updates 1", "popgym-AutoencodeEasy-v0")
     through = new_run(
         tmp_path / "through", f"--environment.wrapper {ONE_HOT} --ppo.updates 2", "popgym-AutoencodeEasy-v0"
     )
-    given = json.loads((run / "settings.json").read_text())
-    assert given["environment"].pop("wrapper") == [ONE_HOT]
-    (run / "settings.json").write_text(json.dumps(given))
-    for file in (run / "checkpoints").iterdir():
-        with safe_open(file, "pt") as content:
-            header = json.loads(content.metadata()["endless"])
-        del header["settings"]["environment"]["wrapper"]
-        file.write_bytes(checkpoint.to_safetensors(load_file(file), header))
-    assert checkpoint.load(run).agent.observation_shapes == {"features": (6,)}
     learn(f"--resume {run} --ppo.updates 2")
     one, two = (checkpoint.load(each).agent for each in (run, through))
     assert one.observation_shapes == {"features": (6,)}

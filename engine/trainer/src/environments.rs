@@ -114,8 +114,7 @@ impl Environments {
         let is_integers =
             spec.observation_space.as_ref().is_some_and(|space| !matches!(space, ObservationSpace::Box { .. }));
         let wrapper = match &wanted.wrapper[..] {
-            // Runs of versions without the previous action have no wrapper.
-            [] if is_integers && settings.resume.is_empty() => vec![VECTORS.to_owned()],
+            [] if is_integers => vec![VECTORS.to_owned()],
             given @ ([] | [_]) if spec.vector_observation == 0 || given.is_empty() => given.to_vec(),
             given => {
                 let rule =

@@ -158,7 +158,6 @@ pub struct Environment {
     /// first of its episode, as POPGym's agents observe them, or `endless_gym_agents.popgym:OneHot`, which does not [default: Vectors
     /// where observations are integers].
     #[arg(long = "environment.wrapper", value_name = "CLASS", value_parser = [VECTORS, ONE_HOT])]
-    #[serde(default)]
     pub wrapper: Vec<String>,
     /// Number of environments in all groups.
     #[arg(long = "environment.num-envs", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
