@@ -3,7 +3,7 @@
 use std::io::Read;
 
 use crate::support::player::Player;
-use crate::support::recorded::{memory_gym_ids, reference, traces, traces_with_views};
+use crate::support::recorded::{check_at_once, reference, traces, traces_with_views};
 use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Trace, TraceError, replay};
@@ -23,16 +23,10 @@ fn replay_all(id: &str) {
     assert!(views > 0, "no ground-truth view of {id} was compared");
 }
 
-macro_rules! traces {
-    ($($name:ident: $id:literal,)*) => { $(
-        #[test]
-        fn $name() {
-            replay_all($id);
-        }
-    )* };
+#[test]
+fn recorded_episodes_replay_without_a_difference() {
+    check_at_once(memory_gym().specs(), |spec| replay_all(spec.id));
 }
-
-memory_gym_ids!(traces);
 
 /// Shows that a replay finds the differences in a wrong trace.
 #[test]

@@ -8,24 +8,15 @@ use proptest::prelude::*;
 use proptest::test_runner::contextualize_config;
 use serde_json::{Map, Value as Json};
 
-/// Calls a macro with all ids of Memory Gym, each after a name for its test.
-macro_rules! memory_gym_ids {
-    ($each:ident) => {
-        $each! {
-            mortar_mayhem: "MortarMayhem-v0",
-            mortar_mayhem_grid: "MortarMayhem-Grid-v0",
-            mortar_mayhem_b: "MortarMayhemB-v0",
-            mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
-            endless_mortar_mayhem: "Endless-MortarMayhem-v0",
-            mystery_path: "MysteryPath-v0",
-            mystery_path_grid: "MysteryPath-Grid-v0",
-            endless_mystery_path: "Endless-MysteryPath-v0",
-            searing_spotlights: "SearingSpotlights-v0",
-            endless_searing_spotlights: "Endless-SearingSpotlights-v0",
+/// Checks all items at once, each in a thread of its own.
+pub fn check_at_once<T: Send>(items: impl Iterator<Item = T>, check: impl Fn(T) + Sync) {
+    let check = &check;
+    std::thread::scope(|scope| {
+        for item in items {
+            scope.spawn(move || check(item));
         }
-    };
+    });
 }
-pub(crate) use memory_gym_ids;
 
 /// The recorded traces of an id.
 pub fn traces(id: &str) -> Vec<PathBuf> {
