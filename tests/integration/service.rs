@@ -6,15 +6,15 @@ use std::time::{Duration, Instant};
 use crate::support::foreign::{self, Foreign, RequestHeader};
 use crate::support::place::Place;
 use crate::support::player::Player;
-use crate::support::process::{TIMEOUT, unshare};
-use crate::support::service::{ID, assert_error, assert_rejected, observed, play, send, set_role, step, try_step};
+use crate::support::process::TIMEOUT;
+use crate::support::service::{ID, assert_error, assert_rejected, observed, play, send, step, try_step};
 use endless_gym::batch::Block;
 use endless_gym::envs::{ActionError, ActionSpace};
 use endless_gym::memory_gym;
 use endless_gym::pool::{EnvReset, PoolConfig, ResetRequest};
 use endless_gym::service::{
-    ConnectConfig, Engine, EngineStatus, Namespace, Observer, ROOT_VARIABLE, Rejection, ServiceError,
-    ServiceSpecification, Trainer, running_engines,
+    ConnectConfig, Engine, EngineStatus, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer,
+    running_engines,
 };
 use endless_gym_core::batch::{ActionSection, Contents, action_layout, batch_layout};
 
@@ -432,20 +432,6 @@ fn a_header_that_changes_after_its_check_is_not_read_again() {
         assert_eq!((received.group(), received.step(), received.blocks().len()), (0, 5, blocks));
         assert_eq!(received.batch().reward(), [0.0]);
     }
-}
-
-#[test]
-#[ignore = "needs permission to create mount namespaces (unshare --mount --map-root-user)"]
-fn too_little_shared_memory_is_an_error_and_not_a_signal() {
-    let place = Place::new();
-    let mut engine = unshare("mount -t tmpfs -o size=4M tmpfs /dev/shm");
-    engine.arg(std::env::current_exe().unwrap()).env(ROOT_VARIABLE, place.root());
-    set_role(&mut engine, "engine gym 64 1");
-    let output = engine.output().unwrap();
-    let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-    assert!(text.contains("running 1 test"), "the engine was not started: {text}");
-    assert!(text.contains("SharedMemoryTooSmall") && text.contains("/dev/shm"), "{text}");
-    assert!(text.contains("fewer environments"), "{text}");
 }
 
 #[test]

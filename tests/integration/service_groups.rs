@@ -2,15 +2,12 @@
 
 use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
-use endless_gym::service::{
-    BatchLease, CheckpointConfig, Engine, EngineConfig, Rejection, ServiceError, Trainer, TrainerGroup,
-};
+use endless_gym::service::{BatchLease, CheckpointConfig, Engine, EngineConfig, ServiceError, Trainer, TrainerGroup};
 
-use crate::support::meeting::PANIC;
 use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::{Process, TIMEOUT};
-use crate::support::service::{ID, assert_error, assert_rejected};
+use crate::support::service::{ID, assert_error};
 
 const NUM_ENVS: usize = 8;
 const GROUPS: usize = 8;
@@ -155,17 +152,6 @@ fn groups_of_two_trainers_are_an_error_and_sorted_groups_keep_their_numbers() {
     let _third = Engine::new(memory_gym(), &place.engine_config("one", 1, 1)).unwrap().spawn().unwrap();
     assert!(one.reconnect(TIMEOUT).unwrap().restarted);
     assert!(!many.reconnect(TIMEOUT).unwrap().restarted);
-}
-
-#[test]
-fn a_panic_of_an_environment_ends_the_engine() {
-    for threads in [1, GROUPS] {
-        let place = Place::new();
-        let (mut engine, mut trainer) = place.meeting(NUM_ENVS, GROUPS, threads);
-        send(&mut trainer.groups()[5], PANIC);
-        assert_rejected(trainer.receive(5, TIMEOUT), Rejection::Panic, "as the trainer wants");
-        assert!(!engine.wait().success());
-    }
 }
 
 /// Threads reset, step and save at the same time, and every group plays what it would play alone.

@@ -1,13 +1,9 @@
 //! Files that are no regular files, claim too much, or have text that a terminal would obey.
 
 use std::io::Write;
-use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use endless_gym::memory_gym;
-use endless_gym::pool::{PoolConfig, ResetRequest};
-use endless_gym::service::{CheckpointConfig, Engine, EngineConfig};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use serde_json::{Value as Json, json};
@@ -75,28 +71,6 @@ fn what_is_not_a_regular_file_is_refused_at_once() {
             assert!(is_refused, "{arguments:?}: {said}");
         }
     }
-}
-
-#[test]
-fn a_checkpoint_replaces_a_planted_link_and_does_not_follow_it() {
-    let place = Place::new();
-    let (path, other) = (place.root().join("state"), place.root().join("other"));
-    std::fs::write(&other, "mine").unwrap();
-    let plant = || symlink(&other, place.root().join("state.new")).unwrap();
-    plant();
-    let checkpoint = Some(CheckpointConfig::new(&path));
-    let config = EngineConfig::new("gym", PoolConfig::new("MysteryPath-Grid-v0", 1), 1);
-    let config = config.checkpoint(checkpoint).namespace(place.namespace().clone());
-    let engine = Engine::new(memory_gym(), &config).unwrap();
-    plant();
-    let engine = engine.spawn().unwrap();
-    let mut trainer = place.trainer("gym").unwrap();
-    trainer.reset(0, ResetRequest::All).unwrap();
-    trainer.receive(0, crate::support::process::TIMEOUT).unwrap();
-    engine.stop();
-    engine.join().unwrap();
-    assert_eq!(std::fs::read_to_string(&other).unwrap(), "mine");
-    assert!(std::fs::symlink_metadata(&path).unwrap().is_file());
 }
 
 /// A file of many tensors without elements: a header of 60 MB, which took seconds to read.

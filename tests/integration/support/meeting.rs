@@ -13,9 +13,6 @@ const ID: &str = "Meeting-v0";
 /// Most environments that can meet.
 pub const MOST: i32 = 64;
 
-/// The action that ends the process of the engine by a panic.
-pub const PANIC: i32 = MOST + 1;
-
 /// How long an environment waits for the others.
 const PATIENCE: Duration = Duration::from_secs(20);
 
@@ -34,7 +31,7 @@ impl Task for Meeting {
 
     fn spec() -> EnvSpec {
         const FEATURES: &[Column] = &[Column { name: "steps", description: "steps of the episode" }];
-        EnvSpec { features: FEATURES, ..EnvSpec::new(ID, "Meet", ActionSpace::Discrete(PANIC + 1)) }
+        EnvSpec { features: FEATURES, ..EnvSpec::new(ID, "Meet", ActionSpace::Discrete(MOST + 1)) }
     }
 
     fn parameters(_: &ResetParameters) {}
@@ -45,7 +42,6 @@ impl Task for Meeting {
 
     fn step(&mut self, (): &(), action: &[i32], _: &mut Generator) -> Transition {
         self.steps += 1;
-        assert_ne!(action[0], PANIC, "as the trainer wants");
         let mut meeting = MEETING.lock().unwrap();
         if action[0] > 1 {
             meeting.0 += 1;
