@@ -7,7 +7,7 @@ use crate::support::recorded::pixel_formats;
 use endless_gym::batch::{BatchSection, Frames, PixelFormat};
 use endless_gym::envs::{EnvSpec, Parameter};
 use endless_gym::memory_gym;
-use endless_gym::pool::{Autoreset, PoolConfig, PoolError, ResetOptions, Seeding};
+use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, Seeding};
 use endless_gym_memory_gym::{FRAME, SCREEN};
 use rand::SeedableRng;
 use rand::rngs::SmallRng;
@@ -109,16 +109,6 @@ fn every_format_is_a_plain_conversion() {
     }
     for format in pixel_formats() {
         compare(memory_gym().spec("Endless-MysteryPath-v0").unwrap(), Frames { format, stack: 3 }, 300);
-    }
-}
-
-#[test]
-fn stacks_of_0_or_65_frames_are_refused() {
-    for given in [0, 65] {
-        let frames = Some(Frames { stack: given, ..Frames::default() });
-        let config = PoolConfig::new("MysteryPath-v0", 1).frames(frames);
-        let error = config.validate(memory_gym().spec("MysteryPath-v0").unwrap()).unwrap_err();
-        assert!(matches!(error, PoolError::Stack { given: found } if found == given), "{error}");
     }
 }
 

@@ -1,8 +1,7 @@
 //! Many environments in lockstep: autoreset, seeding, options, threads, and refused calls.
 
-use std::collections::HashSet;
-
 use crate::support::player::{Player, random_actions};
+use endless_gym::batch::Frames;
 use endless_gym::envs::ActionError;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
@@ -165,14 +164,6 @@ fn episodes_are_seeded_as_configured() {
 }
 
 #[test]
-fn seed_ranges_may_have_a_step() {
-    let seeding = Seeding::Range { start: 4, end: 12, step: 3, seed: Some(1) };
-    let player = Player::started(&PoolConfig::new(ID, 64).seeding(seeding));
-    let expected: HashSet<Vec<u8>> = [4, 7, 10].map(first_frame).into();
-    assert_eq!((0..64).map(|env| frame(&player, env)).collect::<HashSet<_>>(), expected);
-}
-
-#[test]
 fn all_episodes_after_a_seeded_reset_depend_only_on_its_seed() {
     let range = |seed| Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(seed) };
     let pairs = [
@@ -250,21 +241,6 @@ fn a_reset_may_change_the_options() {
 }
 
 #[test]
-fn disabling_frames_changes_nothing_else() {
-    let mut with = Player::started(&config(3).features(true));
-    let mut random = SmallRng::seed_from_u64(5);
-    let mut without = Player::started(&config(3).features(true).frames(None));
-    for _ in 0..100 {
-        let actions = random_actions(with.pool.spec(), 3, &mut random);
-        with.step(&actions);
-        without.step(&actions);
-        assert!(without.batch().observation().is_empty());
-        assert_eq!(with.batch().reward(), without.batch().reward());
-        assert_eq!(with.batch().features(), without.batch().features());
-    }
-}
-
-#[test]
 fn wrong_configurations_are_refused() {
     let refused = |config: PoolConfig| {
         let error = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).err().unwrap();
@@ -282,6 +258,10 @@ fn wrong_configurations_are_refused() {
         assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
     }
     assert!(matches!(refused(config(1).seeding(Seeding::List(vec![]))), PoolError::NoSeeds));
+    for given in [0, 65] {
+        let stacked = config(1).frames(Some(Frames { stack: given, ..Frames::default() }));
+        assert!(matches!(refused(stacked), PoolError::Stack { given: found } if found == given));
+    }
     let empty = Seeding::Range { start: 5, end: 5, step: 1, seed: None };
     assert!(matches!(refused(config(1).seeding(empty)), PoolError::SeedRange { .. }));
     let still = Seeding::Range { start: 4, end: 12, step: 0, seed: None };
