@@ -4,11 +4,8 @@
 #[allow(dead_code)]
 mod t_maze;
 
-use endless_gym::batch::{Frames, PixelFormat};
 use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, Pool, PoolConfig, Registry, RegistryError, ResetOptions, ResetRequest, Threads};
-use rand::SeedableRng;
-use rand::rngs::SmallRng;
 use serde_json::json;
 
 use crate::support::player::Player;
@@ -29,14 +26,14 @@ fn config(autoreset: Autoreset) -> PoolConfig {
     PoolConfig::new(ID, NUM_ENVS).options(options).autoreset(autoreset).features(true).check_drawing(true)
 }
 
-fn player(config: &PoolConfig, threads: usize) -> Player {
-    Player::in_registry(&registry(), config, threads)
+fn player(config: &PoolConfig) -> Player {
+    Player::in_registry(&registry(), config, 1)
 }
 
 /// Walks to the junction and turns to the side of the cue or, if `remembers` is false, to the other side. Returns the
 /// rewards.
 fn play(autoreset: Autoreset, remembers: bool) -> Vec<f64> {
-    let mut player = player(&config(autoreset), 1);
+    let mut player = player(&config(autoreset));
     player.reset(ResetRequest::Seed(1));
     let cues: Vec<i32> = player.batch().features().chunks_exact(2).map(|row| (row[0] == 1.0).into()).collect();
     assert!(cues.contains(&0) && cues.contains(&1));
@@ -59,7 +56,7 @@ fn every_autoreset_mode_plays_a_task() {
 #[test]
 fn truncation_ends_an_episode_and_differs_from_termination() {
     for autoreset in Autoreset::ALL {
-        let mut player = player(&config(autoreset), 1);
+        let mut player = player(&config(autoreset));
         player.reset(ResetRequest::All);
         for step in 1..=8 {
             player.step_all(AHEAD);
@@ -68,28 +65,6 @@ fn truncation_ends_an_episode_and_differs_from_termination() {
         }
         let junction = player.batch().features()[1];
         assert_eq!(junction == 0.0, autoreset == Autoreset::SameStep, "the next episode has started in the same step");
-    }
-}
-
-/// The observations of 60 steps; the pool compares each frame with one that is drawn in full.
-fn observations(frames: Frames, threads: usize) -> Vec<Vec<u8>> {
-    let mut player = player(&config(Autoreset::NextStep).frames(Some(frames)), threads);
-    let mut random = SmallRng::seed_from_u64(3);
-    player.reset(ResetRequest::Seed(5));
-    let mut step = |_| {
-        player.step_at_random(&mut random);
-        player.batch().observation().to_vec()
-    };
-    (0..60).map(&mut step).collect()
-}
-
-#[test]
-fn frames_are_right_in_every_format_for_every_number_of_threads() {
-    let gray = PixelFormat { grayscale: true, channels_first: true, row_major: true };
-    for frames in [Frames::default(), Frames { format: gray, stack: 3 }] {
-        let alone = observations(frames, 1);
-        assert!(alone.iter().any(|frame| *frame != alone[0]));
-        assert!(alone == observations(frames, 2), "{frames:?}");
     }
 }
 
