@@ -229,6 +229,14 @@ fn a_lost_engine_is_found_again_and_is_observed_only_for_a_browser() {
     assert_eq!(listed["engines"][0]["observers"], json!([server.process.id()]));
     drop(socket);
     wait_for_observers(&place, 0);
+    // Loading the page and the list of engines observes no engine.
+    for path in [
+        format!("/?token={}", server.token()),
+        format!("/{}/view.js", server.token()),
+        format!("/{}/engines", server.token()),
+    ] {
+        assert_eq!(server.status(&path, &[]), 200);
+    }
     step(&mut trainer, 0);
     assert_eq!(observers(&place), 0);
 
@@ -325,28 +333,6 @@ fn train_while<R>(trainer: &mut Trainer, work: impl FnOnce() -> R) -> R {
         training.join().unwrap();
         result
     })
-}
-
-#[test]
-fn no_batch_is_taken_without_a_page() {
-    let place = Place::new();
-    let _engine = place.serve(&["--env", "MortarMayhem-Grid-v0", "--num-envs", "4"]);
-    let server = Server::start(place.endless(&["view", "endless"]));
-    let mut trainer = place.trainer("endless").unwrap();
-    reset(&mut trainer, 0);
-    // Loading the page and the list of engines observes no engine.
-    let token = server.token().to_owned();
-    for path in [format!("/?token={token}"), format!("/{token}/view.js"), format!("/{token}/engines")] {
-        assert_eq!(server.status(&path, &[]), 200);
-        step(&mut trainer, 0);
-        assert_eq!(observers(&place), 0, "{path}");
-    }
-    let (_, _, body) = server.get(&format!("/{token}/engines"), &[]);
-    let listed: serde_json::Value = serde_json::from_slice(&body).unwrap();
-    assert_eq!(
-        (&listed["engines"][0]["observers"], &listed["engines"][0]["held_by_observers"]),
-        (&json!([]), &json!(0))
-    );
 }
 
 /// Batches that the page's observer has taken.
