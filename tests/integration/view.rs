@@ -56,15 +56,24 @@ fn the_token_the_host_and_the_origin_are_required() {
     {
         assert_eq!(server.status(path, &[]), 403, "{path}");
     }
-    for foreign in
-        [("Host", "example.org"), ("Host", "localhost"), ("Origin", "http://example.org"), ("Origin", "null")]
-    {
+    let (own, localhost) = (server.address().to_string(), format!("localhost:{}", server.address().port()));
+    let secure = format!("https://{own}");
+    for foreign in [
+        ("Host", "example.org"),
+        ("Host", "localhost"),
+        ("Host", "127.0.0.1:1"),
+        ("Origin", "http://example.org"),
+        ("Origin", "http://127.0.0.1:1"),
+        ("Origin", &*secure),
+        ("Origin", "null"),
+    ] {
         for path in [page.clone(), format!("/{token}/engines"), format!("/{token}/socket?service=endless")] {
             assert_eq!(server.status(&path, &[foreign]), 403, "{foreign:?} {path}");
         }
     }
-    let own = format!("http://{}", server.address());
-    assert_eq!(server.status(&page, &[("Origin", &own)]), 200);
+    for host in [own, localhost] {
+        assert_eq!(server.status(&page, &[("Host", &host), ("Origin", &format!("http://{host}"))]), 200, "{host}");
+    }
     for path in ["../Cargo.toml", "../../etc/passwd", "%2e%2e/Cargo.toml", "files/view.js", "view.rs", "index.html", ""]
     {
         assert_eq!(server.status(&format!("/{token}/{path}"), &[]), 404, "{path}");
