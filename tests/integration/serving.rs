@@ -7,6 +7,7 @@ use std::process::Stdio;
 use std::thread::{self, available_parallelism};
 use std::time::{Duration, Instant};
 
+use crate::support::page::Server;
 use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::{Process, TIMEOUT, text, wait_until};
@@ -366,26 +367,17 @@ fn status_shows_engines_and_their_processes() {
     assert!(said.ends_with("\nthe engine has ended\n"), "{said}");
 }
 
-/// Sends a request and returns the answer, head and body.
-fn http(address: &str, request: &str) -> String {
-    let mut stream = TcpStream::connect(address).unwrap();
-    stream.write_all(request.as_bytes()).unwrap();
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).unwrap();
-    answer
-}
-
 #[test]
 fn metrics_are_served_for_prometheus() {
     let place = Place::new();
-    let mut engine = serve(&place, &["--metrics=127.0.0.1:0"]);
-    let mut lines = BufReader::new(engine.0.stdout.take().unwrap()).lines();
-    let printed = lines.by_ref().map(Result::unwrap).find(|line| line.starts_with("metrics at ")).unwrap();
-    let address = printed.strip_prefix("metrics at http://").unwrap().strip_suffix("/metrics").unwrap().to_owned();
+    let mut server =
+        Server::start(place.endless(&[&["serve"], &ENVIRONMENTS[..], &["--metrics=127.0.0.1:0"]].concat()));
+    let address = server.address();
+    assert_eq!(server.url, format!("http://{address}/metrics"));
     // Clients that send half a request and never read.
     let _stuck: Vec<_> = (0..20)
         .map(|_| {
-            let mut stream = TcpStream::connect(&address).unwrap();
+            let mut stream = TcpStream::connect(address).unwrap();
             stream.write_all(b"GET /metrics HTTP/1.1\r\nHost:").unwrap();
             stream
         })
@@ -394,11 +386,9 @@ fn metrics_are_served_for_prometheus() {
     let mut twin = Twin::new();
     twin.reset(&mut trainer);
     twin.play(&mut trainer, 0..10);
-    let get =
-        |path: &str| http(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n"));
-    let answer = get("/metrics");
-    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("text/plain; version=0.0.4"), "{answer}");
-    let body = answer.split("\r\n\r\n").nth(1).unwrap();
+    let (status, head, body) = server.get("/metrics", &[]);
+    assert!(status == 200 && head.contains("text/plain; version=0.0.4"), "{head}");
+    let body = text(&body);
     for line in [
         "# TYPE endless_gym_env_steps_total counter",
         "endless_gym_env_steps_total{service=\"gym\",group=\"1\"} 30",
@@ -422,20 +412,13 @@ fn metrics_are_served_for_prometheus() {
             _ => {}
         }
     }
-    assert!(get("/").starts_with("HTTP/1.1 404"));
-    assert!(
-        http(
-            &address,
-            &format!("POST /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
-        )
-        .starts_with("HTTP/1.1 405")
-    );
+    assert_eq!(server.status("/", &[]), 404);
     let taken = place.run(&["serve", "--service=other", &format!("--metrics={address}")]);
     assert!(text(&taken.stderr).starts_with(&format!("endless: --metrics {address}: ")), "{}", text(&taken.stderr));
     // The stuck clients do not delay the engine's end.
     let start = Instant::now();
-    engine.signal(Signal::TERM);
-    assert!(engine.wait().success());
+    server.process.signal(Signal::TERM);
+    assert!(server.process.wait().success());
     assert!(start.elapsed() < Duration::from_secs(5));
 }
 

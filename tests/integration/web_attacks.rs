@@ -2,7 +2,6 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -73,26 +72,24 @@ fn an_engine_with_metrics_spends_nothing_on_idle_and_malformed_clients() {
     raise_descriptors();
     let place = Place::new();
     let arguments = ["serve", "--env=MortarMayhem-Grid-v0", "--num-envs=2", "--threads=1", "--metrics=127.0.0.1:0"];
-    let mut engine = Process::spawn(place.endless(&arguments).stdout(Stdio::piped()));
-    let mut lines = BufReader::new(engine.0.stdout.take().unwrap()).lines().map(Result::unwrap);
-    let printed = lines.find_map(|line| line.strip_prefix("metrics at http://").map(str::to_owned)).unwrap();
-    let address: SocketAddr = printed.strip_suffix("/metrics").unwrap().parse().unwrap();
+    let mut server = Server::start(place.endless(&arguments));
+    let (engine, address) = (&server.process, server.address());
     let get = |headers: &str| answer(address, &format!("GET /metrics HTTP/1.1\r\n{headers}\r\n"));
     let own = format!("Host: {address}\r\n");
     let mut trainer = place.trainer("endless").unwrap();
     reset(&mut trainer, 0);
     assert_eq!(get(&own), "HTTP/1.1 200 OK");
-    let ((threads, descriptors), memory) = (used(&engine), resident(&engine));
+    let ((threads, descriptors), memory) = (used(engine), resident(engine));
 
     let idle: Vec<_> = (0..IDLE).map(|_| TcpStream::connect(address).unwrap()).collect();
     attack(address);
     assert_eq!(get(&own), "HTTP/1.1 200 OK");
     step(&mut trainer, 0);
-    let now = used(&engine);
+    let now = used(engine);
     assert!(now.0 == threads && now.1 <= descriptors + MAX_CONNECTIONS, "{now:?}, before {threads}, {descriptors}");
-    assert!(resident(&engine) < memory + 32_000_000, "{} bytes, before {memory}", resident(&engine));
+    assert!(resident(engine) < memory + 32_000_000, "{} bytes, before {memory}", resident(engine));
     drop(idle);
-    wait_until("the connections are closed", || used(&engine).1 <= descriptors);
+    wait_until("the connections are closed", || used(engine).1 <= descriptors);
 
     // Other sites and names.
     let forbidden = "HTTP/1.1 403 Forbidden";
@@ -102,7 +99,7 @@ fn an_engine_with_metrics_spends_nothing_on_idle_and_malformed_clients() {
     for origin in ["http://example.org", "null"] {
         assert_eq!(get(&format!("{own}Origin: {origin}\r\n")), forbidden, "{origin}");
     }
-    engine.interrupt();
+    server.process.interrupt();
 }
 
 /// The request that opens the page's WebSocket.

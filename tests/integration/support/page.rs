@@ -37,13 +37,11 @@ pub struct Server {
 impl Server {
     pub fn start(mut command: Command) -> Self {
         let mut process = Process::spawn(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
-        let mut line = String::new();
-        let mut stdout = BufReader::new(process.0.stdout.take().unwrap());
-        stdout.read_line(&mut line).unwrap();
-        let url = line.trim().split(' ').find(|word| word.starts_with("http://")).map(str::to_owned);
+        let mut lines = BufReader::new(process.0.stdout.take().unwrap()).lines().map_while(Result::ok);
+        let url = lines.find_map(|line| line.split(' ').find(|word| word.starts_with("http://")).map(str::to_owned));
         // Drain later output, so that the process does not block.
-        std::thread::spawn(move || drop(stdout.read_to_end(&mut Vec::new())));
-        let url = url.unwrap_or_else(|| panic!("no address: `{line}` {}", process.errors()));
+        std::thread::spawn(move || lines.for_each(drop));
+        let url = url.unwrap_or_else(|| panic!("no address: {}", process.errors()));
         Server { process, url }
     }
 
