@@ -40,7 +40,7 @@ fn results_do_not_depend_on_the_number_of_threads() {
         let config = PoolConfig::new(spec.id, 331)
             .seeding(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) })
             .features(true);
-        let mut players = [1, 2, 3, 64].map(|threads| Player::with_threads(&config, threads));
+        let mut players = [1, 2, 3, 64].map(|threads| Player::in_registry(memory_gym(), &config, threads));
         players.iter_mut().for_each(|player| player.reset(ResetRequest::All));
         let mut random = SmallRng::seed_from_u64(5);
         for step in 0..80 {

@@ -18,18 +18,10 @@ fn buffers(trainer: &mut Trainer, batches: usize) -> HashSet<usize> {
     (0..batches).map(|_| step(trainer, 0).blocks().as_ptr().addr()).collect()
 }
 
-/// A trainer that has reset the environments.
-fn started(place: &Place) -> Trainer {
-    let mut trainer = place.trainer("gym").unwrap();
-    reset(&mut trainer, 0);
-    trainer
-}
-
 #[test]
 fn the_engine_writes_to_one_buffer_while_observers_are_paused() {
-    let place = Place::new();
-    let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = started(&place);
+    let (place, _engine, mut trainer) = Place::started(NUM_ENVS, 1);
+    reset(&mut trainer, 0);
     assert_eq!(buffers(&mut trainer, 20).len(), 1);
     let mut observers = [(); 2].map(|()| Observer::connect(&place.connect_config("gym"), 0).unwrap());
     assert_eq!(buffers(&mut trainer, 20).len(), 2, "the queue of an observer has the newest batch");
@@ -54,9 +46,8 @@ fn the_engine_writes_to_one_buffer_while_observers_are_paused() {
 
 #[test]
 fn a_lease_is_valid_while_its_observer_is_paused() {
-    let place = Place::new();
-    let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = started(&place);
+    let (place, _engine, mut trainer) = Place::started(NUM_ENVS, 1);
+    reset(&mut trainer, 0);
     let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
     step(&mut trainer, 0);
     let lease = observer.newest().unwrap().unwrap();
@@ -95,7 +86,8 @@ fn a_paused_observer_keeps_its_slot() {
     drop(second);
     let third = connect().unwrap();
     assert!(refused(connect()));
-    let mut trainer = started(&place);
+    let mut trainer = place.trainer("gym").unwrap();
+    reset(&mut trainer, 0);
     assert!(first.newest().unwrap().is_none());
     let sent = step(&mut trainer, 0).step();
     assert_eq!(observed(&mut first, sent).step(), sent);

@@ -172,11 +172,6 @@ impl Chromium {
         }
     }
 
-    /// The page as a PNG, in base64.
-    pub fn screenshot(&mut self) -> String {
-        self.call("Page.captureScreenshot", &json!({"format": "png"}))["data"].as_str().unwrap().to_owned()
-    }
-
     /// Calls a method and waits for its answer.
     pub fn call(&mut self, method: &str, arguments: &Json) -> Json {
         self.calls += 1;

@@ -16,11 +16,7 @@ pub struct Player {
 impl Player {
     /// A pool that has not been reset, with one thread.
     pub fn new(config: &PoolConfig) -> Self {
-        Player::with_threads(config, 1)
-    }
-
-    pub fn with_threads(config: &PoolConfig, threads: usize) -> Self {
-        Player::in_registry(memory_gym(), config, threads)
+        Player::in_registry(memory_gym(), config, 1)
     }
 
     pub fn in_registry(registry: &Registry, config: &PoolConfig, threads: usize) -> Self {

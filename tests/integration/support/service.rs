@@ -19,9 +19,6 @@ use super::process::{Process, TIMEOUT};
 pub const ID: &str = "MortarMayhem-Grid-v0";
 const ROLE: &str = "ENDLESS_TEST_ROLE";
 
-/// Arguments with which a test program runs only its ignored test `role`.
-pub const ROLE_ARGUMENTS: [&str; 4] = ["role", "--exact", "--ignored", "--nocapture"];
-
 impl Place {
     /// A namespace with an engine `gym` in a child process, and its trainer.
     pub fn started(num_envs: usize, groups: usize) -> (Place, Process, Trainer) {
@@ -39,7 +36,8 @@ impl Place {
     /// Starts this test program in a role.
     pub fn role(&self, role: &str) -> Process {
         let mut command = self.command(std::env::current_exe().unwrap());
-        Process::spawn(command.args(ROLE_ARGUMENTS).env(ROLE, role).stdin(Stdio::piped()).stdout(Stdio::null()))
+        set_role(&mut command, role);
+        Process::spawn(command.stdin(Stdio::piped()).stdout(Stdio::null()))
     }
 
     /// The configuration of an engine that checks what it draws.
@@ -50,7 +48,7 @@ impl Place {
 
 /// Sets the role of a command that starts this test program.
 pub fn set_role(command: &mut Command, role: &str) {
-    command.args(ROLE_ARGUMENTS).env(ROLE, role);
+    command.args(["role", "--exact", "--ignored", "--nocapture"]).env(ROLE, role);
 }
 
 fn engine_config(namespace: &Namespace, service: &str, num_envs: usize, groups: usize) -> EngineConfig {
