@@ -71,65 +71,34 @@ pub fn fitting(columns: u16, lines: u16, own: usize) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_core::batch::{Batch, Frames, zeroed};
-    use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
-    use endless_gym_memory_gym::{FRAME, SCREEN, memory_gym};
-    use ratatui::Terminal;
-    use ratatui::backend::TestBackend;
+    use endless_gym_memory_gym::SCREEN;
 
-    use super::super::frame::newest;
     use super::*;
 
-    /// A frame of an environment, and its pixels in the original's order, indexed \[x\]\[y\].
-    fn frame() -> (Pixels, Vec<[u8; 3]>) {
-        let mut pool =
-            Pool::new(memory_gym(), &PoolConfig::new("MortarMayhem-v0", 1), &Threads::new(1).unwrap()).unwrap();
-        let mut blocks = zeroed(pool.layout().blocks());
-        pool.reset(ResetRequest::Seed(4), &mut blocks).unwrap();
-        let observation = Batch::new(pool.layout(), &blocks).observation();
-        (newest(observation, Frames::default(), FRAME), observation.as_chunks::<3>().0.to_vec())
-    }
-
     #[test]
-    fn cells_have_the_frames_pixels() {
-        let (picture, original) = frame();
-        let colour = |x: usize, y: usize| Color::from(original[x * SCREEN + y]);
-        assert!((0..SCREEN).any(|x| (0..SCREEN / 2).any(|y| colour(x, 2 * y) != colour(x, 2 * y + 1))));
-        for scale in [1, 2] {
-            let side = (SCREEN * scale) as u16;
-            assert_eq!(fitting(side + 3, side / 2 + 1, SCREEN), usize::from(side));
-            let mut terminal = Terminal::new(TestBackend::new(side + 3, side / 2 + 1)).unwrap();
-            let area = Rect::new(2, 1, side, side / 2);
-            terminal.draw(|frame| frame.render_widget(&picture.resized(side.into()), area)).unwrap();
-            let buffer = terminal.backend().buffer();
-            for (x, row) in (0..side).flat_map(|x| (0..side / 2).map(move |row| (x, row))) {
-                let cell = &buffer[(2 + x, 1 + row)];
-                let pixel = |y: u16| colour(usize::from(x) / scale, usize::from(y) / scale);
-                assert_eq!((cell.symbol(), cell.fg, cell.bg), ("▀", pixel(2 * row), pixel(2 * row + 1)), "{x} {row}");
-            }
-            assert_eq!(buffer[(1, 1)].symbol(), " ");
-        }
-    }
-
-    #[test]
-    fn smaller_pictures_have_averages() {
+    fn smaller_pictures_have_averages_and_larger_ones_squares() {
         let mut pixels = vec![[0; 3]; SCREEN * SCREEN];
         pixels[10 * SCREEN + 21] = [0, 200, 40];
-        let half = Pixels { side: SCREEN, pixels }.resized(SCREEN / 2);
+        let picture = Pixels { side: SCREEN, pixels };
         let mut expected = vec![[0; 3]; SCREEN * SCREEN / 4];
         expected[5 * SCREEN / 2 + 10] = [0, 50, 10];
-        assert_eq!(half.pixels, expected);
+        assert_eq!(picture.resized(SCREEN / 2).pixels, expected);
+        let mut expected = vec![[0; 3]; 4 * SCREEN * SCREEN];
+        for place in [20, 21].map(|row| row * 2 * SCREEN + 42) {
+            expected[place..place + 2].fill([0, 200, 40]);
+        }
+        assert_eq!(picture.resized(2 * SCREEN).pixels, expected);
     }
 
     #[test]
     fn a_picture_is_cut_where_the_terminal_ends() {
-        let (picture, _) = frame();
+        let picture = Pixels { side: SCREEN, pixels: vec![[9; 3]; SCREEN * SCREEN] };
         let mut buffer = Buffer::empty(Rect::new(0, 0, 5, 2));
         (&picture).render(Rect::new(0, 0, 5, 2), &mut buffer);
         assert_eq!(buffer[(4, 1)].symbol(), "▀");
         assert_eq!(
-            [(0, 9), (80, 21), (83, 50), (200, 50)].map(|(columns, lines)| fitting(columns, lines, SCREEN)),
-            [0, 42, 82, 84]
+            [(0, 9), (80, 21), (83, 50), (200, 50), (171, 85)].map(|(columns, lines)| fitting(columns, lines, SCREEN)),
+            [0, 42, 82, 84, 168]
         );
     }
 }
