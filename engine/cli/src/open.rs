@@ -1,6 +1,5 @@
 //! Opens a page in the user's browser.
 
-use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
 use std::hash::{BuildHasher, RandomState};
 use std::io::{self, Write};
@@ -59,20 +58,15 @@ pub fn in_browser(url: &str) {
     print_error(format_args!("--open found no browser ({}); open the address yourself", failures.join(", ")));
 }
 
+/// Starts a browser; the address replaces its placeholders or is the last argument.
 fn start(command: &str, url: &str) -> io::Result<Child> {
-    let (program, arguments) = words(command, url);
-    Command::new(program).args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn()
-}
-
-/// The program and its arguments, one of which is the address.
-fn words(command: &str, url: &str) -> (OsString, Vec<OsString>) {
     let mut words = command.split_whitespace();
-    let program = words.next().unwrap_or_default().into();
-    let mut arguments: Vec<OsString> = words.map(|word| word.replace("%s", url).into()).collect();
+    let mut browser = Command::new(words.next().unwrap_or_default());
+    browser.args(words.map(|word| word.replace("%s", url)));
     if !command.contains("%s") {
-        arguments.push(url.into());
+        browser.arg(url);
     }
-    (program, arguments)
+    browser.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn()
 }
 
 /// Reaps the process and reports its failure: `xdg-open` fails where there is no desktop.
@@ -85,24 +79,4 @@ fn report_end(command: String, mut child: Child) {
     };
     // Without a thread, the process is reaped when this one ends.
     let _ = thread::Builder::new().name("browser".to_owned()).spawn(wait);
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_address_replaces_its_placeholder_or_comes_last() {
-        let text = |command| {
-            let (program, arguments) = words(command, "http://127.0.0.1:1/?a=b&c");
-            std::iter::once(program)
-                .chain(arguments)
-                .map(|word| word.into_string().unwrap())
-                .collect::<Vec<_>>()
-                .join("|")
-        };
-        assert_eq!(text("firefox"), "firefox|http://127.0.0.1:1/?a=b&c");
-        assert_eq!(text("firefox --new-window %s"), "firefox|--new-window|http://127.0.0.1:1/?a=b&c");
-        assert_eq!(text("w3m  --url=%s -t"), "w3m|--url=http://127.0.0.1:1/?a=b&c|-t");
-    }
 }
