@@ -77,7 +77,10 @@ fn list_shows_pictures_in_terminals_with_colours() {
     let table = |output: &str| output.lines().map(|line| line.matches('─').count()).max();
     assert_eq!([table(&narrow), table(&wide)], [Some(80), Some(90)]);
     assert_eq!(pixels(&in_terminal(90, list(&[]).env("NO_COLOR", "1"))), 0);
-    assert_eq!(pixels(&in_terminal(90, list(&[]).env("COLORTERM", ""))), 0);
+    assert_eq!(
+        ["24bit", "256color", ""].map(|value| pixels(&in_terminal(90, list(&[]).env("COLORTERM", value)))),
+        [2 * 42 * 21, 0, 0]
+    );
     assert_eq!(pixels(&in_terminal(90, &mut list(&["--picture", "never"]))), 0);
     assert_eq!(pixels(&in_terminal(90, &mut list(&["--json"]))), 0);
 }

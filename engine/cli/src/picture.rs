@@ -2,7 +2,7 @@
 
 use std::io::{self, IsTerminal};
 
-use clap::ValueEnum;
+use clap::ColorChoice;
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::envs::view::Picture;
 use endless_gym_core::pool::{PoolConfig, Registry, Seeding};
@@ -12,32 +12,15 @@ use crate::film::Film;
 use crate::policies::Policy;
 use crate::terminal::picture::Pixels;
 
-/// When to print a picture.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum When {
-    /// In a terminal with 24-bit colours: COLORTERM is `truecolor` or `24bit`, and NO_COLOR is not set.
-    Auto,
-    /// Always.
-    Always,
-    /// Never.
-    Never,
-}
-
-impl When {
-    /// Whether to print a picture to standard output.
-    pub fn applies(self) -> bool {
-        let variable = |name| std::env::var(name).unwrap_or_default();
-        match self {
-            When::Auto => io::stdout().is_terminal() && true_colour(&variable("COLORTERM"), &variable("NO_COLOR")),
-            When::Always => true,
-            When::Never => false,
-        }
-    }
-}
-
-/// Whether these values of COLORTERM and NO_COLOR permit 24-bit colours.
-fn true_colour(colorterm: &str, no_color: &str) -> bool {
-    matches!(colorterm, "truecolor" | "24bit") && no_color.is_empty()
+/// Whether to print a picture to standard output.
+pub fn applies(when: ColorChoice) -> bool {
+    let variable = |name| std::env::var(name).unwrap_or_default();
+    let has_colours = || {
+        io::stdout().is_terminal()
+            && matches!(&*variable("COLORTERM"), "truecolor" | "24bit")
+            && variable("NO_COLOR").is_empty()
+    };
+    when == ColorChoice::Always || (when == ColorChoice::Auto && has_colours())
 }
 
 /// Pixels of the picture in each direction. A character shows two of them, one above the other.
@@ -100,15 +83,8 @@ fn half_block_line(rows: &[[u8; 3]]) -> String {
 
 #[cfg(test)]
 mod tests {
-
     use super::*;
     use endless_gym_memory_gym::memory_gym;
-
-    #[test]
-    fn colours_need_a_capable_terminal_and_no_no_color() {
-        assert!(true_colour("truecolor", "") && true_colour("24bit", ""));
-        assert!(!true_colour("", "") && !true_colour("256color", "") && !true_colour("truecolor", "1"));
-    }
 
     #[test]
     fn a_line_shows_two_rows_and_sets_each_colour_once() {

@@ -1,5 +1,6 @@
 //! `endless list`.
 
+use clap::ColorChoice;
 use endless_gym_core::batch::Frames;
 use endless_gym_core::envs::{ActionBranch, EnvSpec};
 use endless_gym_core::pool::Registry;
@@ -7,7 +8,7 @@ use serde_json::json;
 
 use crate::failure::Failure;
 use crate::output::{self, print, print_coloured, print_json, table};
-use crate::picture::{When, picture};
+use crate::picture::{applies, picture};
 
 /// Arguments of `endless list`.
 #[derive(clap::Args)]
@@ -17,9 +18,10 @@ pub struct Args {
     /// Print JSON [default: text].
     #[arg(long, conflicts_with = "picture")]
     json: bool,
-    /// When to show a picture of the environment made of coloured characters.
+    /// When to show a picture of the environment made of coloured characters. With `auto`, in a terminal with 24-bit colours: COLORTERM
+    /// is `truecolor` or `24bit`, and NO_COLOR is not set.
     #[arg(long, value_enum, value_name = "WHEN", default_value = "auto", requires = "id")]
-    picture: When,
+    picture: ColorChoice,
 }
 
 /// Runs `endless list`.
@@ -29,7 +31,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
             let spec = registry.spec(id)?;
             match () {
                 _ if args.json => print_json(&as_json(spec)),
-                _ if args.picture.applies() && spec.shown().is_some() => {
+                _ if applies(args.picture) && spec.shown().is_some() => {
                     print_coloured(format_args!("{}\n{}", picture(registry, spec, output::width())?, description(spec)))
                 }
                 _ => print(description(spec)),
