@@ -54,14 +54,3 @@ pub fn magnified<T: Copy>(pixels: &[T], width: usize, scale: usize) -> Vec<T> {
     let wide = |row: &[T]| row.iter().flat_map(|pixel| std::iter::repeat_n(*pixel, scale)).collect::<Vec<T>>();
     pixels.chunks_exact(width).flat_map(|row| wide(row).repeat(scale)).collect()
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_pixel_becomes_a_square() {
-        assert_eq!(magnified(&[1, 2, 3, 4], 2, 1), [1, 2, 3, 4]);
-        assert_eq!(magnified(&[1, 2, 3, 4], 2, 2), [1, 1, 2, 2, 1, 1, 2, 2, 3, 3, 4, 4, 3, 3, 4, 4]);
-    }
-}
