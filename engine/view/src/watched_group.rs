@@ -8,11 +8,10 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::{Batch, Block};
+use endless_gym_core::batch::Block;
 use endless_gym_service::{BatchLease, Observer, ServiceError};
 
-/// Time between two frames for a browser, and so between two batches that are taken. The means miss episodes that end
-/// in other batches.
+/// Time between two frames for a browser, and so between two batches that are taken.
 const FRAME_INTERVAL: Duration = Duration::from_millis(33);
 
 /// The shortest such time while the engine is busy, since resuming creates files and mappings.
@@ -77,21 +76,21 @@ impl WatchedGroup {
         self.observer.step().map_or_else(|| self.observer.has_newer(), |step| step > self.last.0)
     }
 
-    /// Replaces the held batch with the newest one, if one is wanted and there is one.
-    pub fn take(&mut self) -> Result<Option<Batch<'_>>, ServiceError> {
+    /// Replaces the held batch with the newest one, if one is wanted and there is one. Returns whether there was one.
+    pub fn take(&mut self) -> Result<bool, ServiceError> {
         if !self.is_wanted || !self.is_followed() {
-            return Ok(None);
+            return Ok(false);
         }
         // Dropped first, since the engine may permit only one lease.
         self.newest = None;
         self.newest = self.received()?;
-        let Some(lease) = &self.newest else { return Ok(None) };
+        let Some(lease) = &self.newest else { return Ok(false) };
         let (step, time) = std::mem::replace(&mut self.last, (lease.step(), Instant::now()));
         let batches = lease.step().saturating_sub(step) as f64;
         let busy_rate = if self.is_shown { BUSY_RATE } else { BUSY_RATE_HIDDEN };
         self.is_busy = batches >= busy_rate * time.elapsed().as_secs_f64();
         self.is_wanted = false;
-        Ok(Some(lease.batch()))
+        Ok(true)
     }
 
     /// The newest batch. Waits for it after a pause, so that the queue does not hold it longer than necessary.
@@ -130,10 +129,5 @@ impl WatchedGroup {
     /// The newest batch, if it is held.
     pub fn newest(&self) -> Option<&BatchLease> {
         self.newest.as_ref()
-    }
-
-    /// An error if the engine has ended.
-    pub fn check_alive(&self) -> Result<(), ServiceError> {
-        self.observer.check_alive()
     }
 }

@@ -145,12 +145,14 @@ impl Observation {
                     group.want(is_shown);
                 }
             }
-            if self.take()? {
-                (is_news, heard) = (true, Instant::now());
+            for group in &mut self.groups {
+                if group.take()? {
+                    (is_news, heard) = (true, Instant::now());
+                }
             }
             self.look(&viewers);
             if heard.elapsed() >= LIVENESS_INTERVAL {
-                self.check_alive()?;
+                self.groups[0].observer().check_alive()?;
                 heard = Instant::now();
             }
             self.show(channel, &shown, is_news);
@@ -158,15 +160,6 @@ impl Observation {
             let is_urgent = self.groups.iter().any(WatchedGroup::is_urgent);
             thread::sleep(if is_urgent { URGENT_INTERVAL } else { INTERVAL });
         }
-    }
-
-    /// Takes the newest batch of each group from which one is wanted. Returns whether there was any.
-    fn take(&mut self) -> Result<bool, ServiceError> {
-        let mut is_new = false;
-        for group in &mut self.groups {
-            is_new |= group.take()?.is_some();
-        }
-        Ok(is_new)
     }
 
     /// Asks the engine to draw what the browsers show, if its batches have no frames, and reads what it has drawn.
@@ -197,11 +190,6 @@ impl Observation {
 
     fn drawn_for(&self, viewer: &Arc<Viewer>) -> Option<&Pictures> {
         self.pictures.iter().find(|(other, _)| Arc::ptr_eq(other, viewer)).map(|(_, pictures)| pictures)
-    }
-
-    /// An error if the engine has ended.
-    fn check_alive(&self) -> Result<(), ServiceError> {
-        self.groups.first().map_or(Ok(()), WatchedGroup::check_alive)
     }
 
     fn read_status(&mut self, channel: &Channel, with_details: bool) {
