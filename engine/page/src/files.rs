@@ -35,16 +35,6 @@ pub fn decompress(file: &[u8]) -> Vec<u8> {
     GzDecoder::new(file).read_to_end(&mut bytes).map_or_else(|_| Vec::new(), |_| bytes)
 }
 
-/// Whether an engine contains the text of an id. One that does not cannot have the environment.
-///
-/// ```
-/// assert!(endless_gym_page::names(b"\0asm..TMaze-v0..", "TMaze-v0"));
-/// assert!(!endless_gym_page::names(b"\0asm..TMaze-v0..", "Maze-v1"));
-/// ```
-pub fn names(engine: &[u8], id: &str) -> bool {
-    engine.windows(id.len().max(1)).any(|part| part == id.as_bytes())
-}
-
 /// Names and contents of all files of a page with these engines by their names, for any web server. `has_id` says whether they have
 /// an environment: agents of others are left out.
 ///

@@ -19,6 +19,6 @@ pub mod server;
 
 #[cfg(feature = "server")]
 pub use error::ServerError;
-pub use files::{ENGINES, FILES, decompress, file, files, names};
+pub use files::{ENGINES, FILES, decompress, file, files};
 #[cfg(feature = "server")]
 pub use play::PlayServer;

@@ -68,7 +68,8 @@ fn check(engines: &[Vec<u8>], id: &str) -> Result<(), ServerError> {
     if engines.is_empty() {
         return Err(ServerError::PageNotBuilt);
     }
-    let is_on_page = engines.iter().any(|engine| files::names(engine, id));
+    // An engine without the text of the id cannot have the environment.
+    let is_on_page = engines.iter().any(|engine| engine.windows(id.len().max(1)).any(|part| part == id.as_bytes()));
     is_on_page.then_some(()).ok_or_else(|| ServerError::NotOnPage { id: id.to_owned() })
 }
 
