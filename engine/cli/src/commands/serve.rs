@@ -21,32 +21,18 @@ use crate::stop::{self, Watchdog};
 /// How often the command checks whether the engine has ended.
 const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
-/// The arguments, or groups of arguments, that make up a configuration.
-const CONFIGURATION: [&str; 14] = [
-    "EnvironmentArgs",
-    "FrameArgs",
-    "id",
-    "num_envs",
-    "threads",
-    "pin_threads",
-    "groups",
-    "service",
-    "autoreset",
-    "final_observation",
-    "features",
-    "state",
-    "batches_held",
-    "checkpoint",
-];
-
 /// Arguments of `endless serve`.
 #[derive(clap::Args)]
 pub struct Args {
     /// Read the engine's configuration as JSON from FILE, or from standard input for `-` [default: the options below].
-    #[arg(long, value_name = "FILE", conflicts_with_all = CONFIGURATION)]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["EngineArgs", "EnvironmentArgs", "FrameArgs"])]
     config: Option<PathBuf>,
     #[command(flatten)]
     engine: EngineArgs,
+    #[command(flatten)]
+    environment: EnvironmentArgs,
+    #[command(flatten)]
+    frames: FrameArgs,
     /// Serve metrics for Prometheus at http://ADDRESS/metrics, such as 127.0.0.1:9100; port 0 takes any free port.
     #[arg(long, value_name = "ADDRESS")]
     metrics: Option<SocketAddr>,
@@ -57,7 +43,8 @@ pub struct Args {
     child: Option<Option<u32>>,
 }
 
-/// The engine's configuration.
+/// The engine's configuration, except environments and frames: clap makes a group of the arguments of a struct without flattened
+/// fields.
 #[derive(clap::Args)]
 struct EngineArgs {
     /// Environment id; `endless list` lists them.
@@ -79,8 +66,6 @@ struct EngineArgs {
     /// Name of the engine, by which trainers find it: 1 to 64 letters, digits, `.`, `_` or `-`.
     #[arg(long, value_name = "NAME", default_value = "endless", alias = "name")]
     service: String,
-    #[command(flatten)]
-    environment: EnvironmentArgs,
     /// When the next episode starts after one has ended, as in Gymnasium.
     #[arg(long, value_name = "MODE", value_parser = autoreset_parser(), default_value = autoreset_value(Autoreset::default()))]
     autoreset: Autoreset,
@@ -93,8 +78,6 @@ struct EngineArgs {
     /// Also write the hidden Markov state, of environments that tell it: those of POPGym.
     #[arg(long)]
     state: bool,
-    #[command(flatten)]
-    frames: FrameArgs,
     /// Batches of each group that the trainer may hold at a time, 1 to 16.
     #[arg(long, default_value_t = 3)]
     batches_held: usize,
@@ -110,13 +93,12 @@ struct EngineArgs {
 }
 
 impl EngineArgs {
-    fn configure(&self) -> Result<EngineConfig, Failure> {
-        let pool = self
-            .environment
+    fn configure(&self, environment: &EnvironmentArgs, frames: FrameArgs) -> Result<EngineConfig, Failure> {
+        let pool = environment
             .configure(&self.id, self.num_envs)?
             .autoreset(self.autoreset)
             .final_observation(self.final_observation)
-            .frames(self.frames.frames())
+            .frames(frames.frames())
             .features(self.features)
             .state(self.state);
         let checkpoint =
@@ -163,7 +145,8 @@ fn watch(engine: &Engine, config: &EngineConfig, stop: &'static AtomicBool) -> R
 /// Runs `endless serve`, until a signal stops it.
 pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     // Before `on_signal`, so that a signal still ends a process that waits for standard input.
-    let mut config = args.config.as_deref().map_or_else(|| args.engine.configure(), read)?;
+    let configured = || args.engine.configure(&args.environment, args.frames);
+    let mut config = args.config.as_deref().map_or_else(configured, read)?;
     let stop = stop::on_signal()?;
     if let Some(parent) = args.child {
         stop::with_parent(stop, parent)?;
