@@ -40,7 +40,8 @@ impl Environment for MortarMayhem {
     shared_methods!();
 
     fn new(assets: &Arc<Assets>) -> Self {
-        MortarMayhem { assets: Arc::clone(assets), state: State::new(), earlier_sprites: Arc::clone(&assets.character) }
+        let earlier_sprites = Arc::clone(&assets.character);
+        MortarMayhem { assets: Arc::clone(assets), state: State::default(), earlier_sprites }
     }
 
     fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {

@@ -12,9 +12,10 @@ use endless_gym_core::envs::Progress;
 /// The character that frames show after an episode's first frame.
 ///
 /// The original's endless id keeps showing the last episode's character until the agent may move in the new episode.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) enum DisplayedCharacter {
     /// The current one, since no episode has played a step yet.
+    #[default]
     Initial,
     /// The current episode's.
     Current,
@@ -23,7 +24,7 @@ pub(super) enum DisplayedCharacter {
 }
 
 /// Everything that changes during play.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct State {
     pub(super) agent: Character,
     pub(super) displayed: DisplayedCharacter,
@@ -58,32 +59,6 @@ pub struct State {
 }
 
 impl State {
-    /// The state before the first reset.
-    pub(super) fn new() -> Self {
-        State {
-            agent: Character::default(),
-            displayed: DisplayedCharacter::Initial,
-            first_frame: true,
-            shown_command: None,
-            commands: Vec::new(),
-            agent_tile: (0, 0),
-            target: (0, 0),
-            tiles_on: false,
-            display: DisplaySchedule::default(),
-            view_display: DisplaySchedule::default(),
-            show_duration: 0,
-            show_delay: 0,
-            explosion_duration: 1,
-            explosion_delay: 1,
-            current_command: 0,
-            command_steps: 0,
-            verify_steps: 0,
-            steps: 0,
-            total_completed: 0,
-            success: false,
-        }
-    }
-
     /// Whether an environment can be in this state. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self, config: &Config) -> bool {
         let displayed_is_valid = match &self.displayed {

@@ -14,9 +14,10 @@ use endless_gym_core::envs::Progress;
 pub(super) const SPAWN_MARGIN: i32 = 7;
 
 /// The background of the screen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Background {
     /// White and blue tiles.
+    #[default]
     Blue,
     /// White and red tiles.
     Red,
@@ -27,7 +28,7 @@ pub(super) enum Background {
 }
 
 /// Everything that changes during play.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct State {
     pub(super) agent: Character,
     /// The previous episode's agent, which the ground-truth view shows until the first step of an episode.
@@ -83,33 +84,8 @@ pub(super) struct Exit {
 impl State {
     /// The state before the first reset.
     pub(super) fn new() -> Self {
-        State {
-            agent: Character::default(),
-            former_agent: None,
-            first_frame: true,
-            health: 0.0,
-            red_columns: 0,
-            spotlights: Vec::new(),
-            spawn_timer: 0,
-            spawns_left: 0,
-            lit: Vec::new(),
-            outlined: false,
-            darkness: 0,
-            coins: Vec::new(),
-            num_coins: 0,
-            coins_collected: 0,
-            exit: None,
-            last_action: [0, 0],
-            shown_action: [0, 0],
-            last_reward_positive: false,
-            shown_reward_positive: false,
-            hit: false,
-            backgrounds: [Background::Blue, Background::Red],
-            background: Background::Blue,
-            steps: 0,
-            coin_steps: 0,
-            success: false,
-        }
+        let backgrounds = [Background::Blue, Background::Red];
+        State { first_frame: true, backgrounds, ..State::default() }
     }
 
     /// Whether an environment can be in this state. A forged snapshot may hold any numbers.
