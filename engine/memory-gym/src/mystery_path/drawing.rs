@@ -174,11 +174,11 @@ impl Assets {
     /// Draws the original's ground-truth view, with what the observation hides: the finite ids' path, goal, origin and walls,
     /// or the endless id's whole path and stamina.
     pub(super) fn draw_ground_truth(&self, state: &State, canvas: &mut Canvas<'_>) {
-        self.paint_background(state.endless.background(), canvas);
+        self.paint_background(state.endless.background, canvas);
         if self.config.variant == Variant::Endless {
             // The position of the whole path's picture is truncated to whole pixels once, unlike the positions of the past
             // path's tiles.
-            let shift = -state.endless.camera() as i32;
+            let shift = -state.endless.camera as i32;
             for (x, y) in state.route.tiles() {
                 canvas.blit(&self.path_tile, x * TILE + shift, y * TILE);
             }

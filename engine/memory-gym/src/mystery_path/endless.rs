@@ -30,17 +30,19 @@ pub enum Direction {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EndlessState {
     /// Left edge of the screen in pixels of the path's coordinates. Summed step by step, which determines its rounding.
-    camera: f64,
+    pub(super) camera: f64,
     /// Pixels that the background has scrolled to the left, less than a tile.
-    background: i32,
-    stamina: i64,
+    pub(super) background: i32,
+    /// Number of steps left to make progress.
+    pub(super) stamina: i64,
     /// The farthest column of the path that the agent was on.
-    farthest: i32,
+    pub(super) farthest: i32,
     /// Tiles in the farthest column or beyond where the agent fell off. A second fall at one of them ends the episode.
     falls: Vec<Tile>,
     /// Index in the route of the last tile that the agent was on.
     at: usize,
-    direction: Direction,
+    /// Direction of the path from the last tile that the agent was on.
+    pub(super) direction: Direction,
 }
 
 impl EndlessState {
@@ -129,16 +131,6 @@ impl EndlessState {
         };
     }
 
-    /// Number of steps left to make progress.
-    pub(super) fn stamina_left(&self) -> i64 {
-        self.stamina
-    }
-
-    /// Restores all stamina.
-    pub(super) fn restore_stamina(&mut self, stamina: i64) {
-        self.stamina = stamina;
-    }
-
     /// Spends one unit of stamina. Returns whether none is left.
     pub(super) fn spend_stamina(&mut self) -> bool {
         self.stamina -= 1;
@@ -150,29 +142,9 @@ impl EndlessState {
         ((f64::from(x) - self.camera).round() as i32, y)
     }
 
-    /// Left edge of the screen in pixels of the path's coordinates.
-    pub(super) fn camera(&self) -> f64 {
-        self.camera
-    }
-
-    /// Pixels that the background has scrolled to the left, less than a tile.
-    pub(super) fn background(&self) -> i32 {
-        self.background
-    }
-
     /// The share of the stamina that is left, at most 1. Negative if the episode continues after its end.
     pub(super) fn stamina_share(&self, full: i64) -> f64 {
         self.stamina.min(full) as f64 / full as f64
-    }
-
-    /// The farthest column of the path that the agent was on.
-    pub(super) fn farthest(&self) -> i32 {
-        self.farthest
-    }
-
-    /// Direction of the path from the last tile that the agent was on.
-    pub(super) fn direction(&self) -> Direction {
-        self.direction
     }
 
     /// The tiles before the last one that the agent was on, backwards to the column that is `depth` columns before the one next

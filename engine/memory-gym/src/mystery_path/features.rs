@@ -128,10 +128,10 @@ impl State {
             out[STAMINA + 1] = self.endless.stamina_share(parameters.stamina_level).max(0.0) as f32;
         }
         if parameters.show_background {
-            out[BACKGROUND] = self.endless.background() as f32 / TILE as f32;
+            out[BACKGROUND] = self.endless.background as f32 / TILE as f32;
         }
         if parameters.show_past_path {
-            let camera = self.endless.camera() / f64::from(TILE);
+            let camera = self.endless.camera / f64::from(TILE);
             for (_, (x, row)) in self.past_tiles(config) {
                 let column = (x - camera.floor() as i32).clamp(0, GRID);
                 out[PAST_SHIFT] = (camera - camera.floor()) as f32;

@@ -79,7 +79,7 @@ impl Environment for MysteryPath {
     fn ground_truth(&self, out: &mut [f64]) {
         out.fill(0.0);
         if self.assets.config.variant == Variant::Endless {
-            out[self.state.endless.direction() as usize] = 1.0;
+            out[self.state.endless.direction as usize] = 1.0;
         }
     }
 

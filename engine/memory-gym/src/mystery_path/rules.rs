@@ -120,7 +120,7 @@ impl State {
         }
         if visit.first_since_fall {
             transition.reward += parameters.reward_path_progress_dense;
-            self.endless.restore_stamina(parameters.stamina_level);
+            self.endless.stamina = parameters.stamina_level;
         }
         if config.variant == Variant::Endless {
             self.endless.arrive(self.tile, &self.route);

@@ -51,21 +51,21 @@ impl State {
             agent: self.shown_agent(config),
             spent: parameters.show_stamina.then(|| self.spent_stamina(config)),
             cross: self.cross,
-            background: if parameters.show_background { self.endless.background() } else { 0 },
+            background: if parameters.show_background { self.endless.background } else { 0 },
         }
     }
 
     fn past(&self, config: &Config) -> PastPath {
         // At most eight columns are on the screen.
         let Some(first) = self.past_tiles(config).map(|(_, (x, _))| x).min() else { return PastPath::default() };
-        let mut past = PastPath { camera: self.endless.camera(), first, tiles: TileSet::default() };
+        let mut past = PastPath { camera: self.endless.camera, first, tiles: TileSet::default() };
         self.past_tiles(config).for_each(|(_, (x, y))| past.tiles.insert((x - first, y)));
         past
     }
 
     /// The past path's tiles on the screen, each with its left edge in pixels, truncated as it is drawn.
     pub(super) fn past_tiles(&self, config: &Config) -> impl Iterator<Item = (i32, Tile)> {
-        let camera = self.endless.camera();
+        let camera = self.endless.camera;
         self.endless
             .past_path(self.tile, config.past_depth, &self.route)
             .map(move |(x, y)| ((f64::from(x * TILE) - camera) as i32, (x, y)))

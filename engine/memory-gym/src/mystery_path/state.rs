@@ -67,7 +67,7 @@ impl State {
         let falls = Progress::count("falls", self.fails);
         if config.variant == Variant::Endless {
             let of = config.parameters.stamina_level as f64;
-            let stamina = Progress::share("stamina", self.endless.stamina_left() as f64, of);
+            let stamina = Progress::share("stamina", self.endless.stamina as f64, of);
             return vec![Progress::count("tiles", self.tiles_visited), falls, stamina];
         }
         let tiles = self.tiles_visited + u32::from(self.success);
@@ -83,6 +83,6 @@ impl State {
 
     /// The final info of the endless id: falls, the farthest column, and tiles visited.
     pub(super) fn endless_info(&self) -> [f64; 3] {
-        [f64::from(self.fails), f64::from(self.endless.farthest()), f64::from(self.tiles_visited)]
+        [f64::from(self.fails), f64::from(self.endless.farthest), f64::from(self.tiles_visited)]
     }
 }
