@@ -5,6 +5,7 @@ use super::config::{Config, TILE};
 use super::parameters::Variant;
 use super::path::GRID;
 use super::state::State;
+use crate::controls::column;
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Column;
 
@@ -13,25 +14,20 @@ pub(super) const AGENT: usize = 0;
 pub(super) const HEADING: usize = 2;
 pub(super) const FALLEN: usize = 4;
 const SHARED: usize = FALLEN + 1;
-/// Indices in [`FINITE_FEATURES`].
+/// Indices in [`finite_features`].
 const ORIGIN: usize = SHARED;
 const GOAL: usize = ORIGIN + 3;
-/// Indices in [`ENDLESS_FEATURES`].
+/// Indices in [`endless_features`].
 pub(super) const STAMINA: usize = SHARED;
 pub(super) const BACKGROUND: usize = STAMINA + 2;
 pub(super) const PAST_SHIFT: usize = BACKGROUND + 1;
 pub(super) const PAST_PATH: usize = PAST_SHIFT + 1;
 
 /// Columns of tiles that are on the screen in whole or in part.
-const SCREEN_COLUMNS: usize = GRID as usize + 1;
-const SCREEN_TILES: usize = SCREEN_COLUMNS * GRID as usize;
+const SCREEN_COLUMNS: i32 = GRID + 1;
 
 /// Divisor of a tile's column and row.
 const LAST_TILE: f32 = GRID as f32 - 1.0;
-
-const fn column(name: &'static str, description: &'static str) -> Column {
-    Column { name, description }
-}
 
 const SHARED_COLUMNS: [Column; SHARED] = [
     column("agent_x", "horizontal centre of the agent on the screen, divided by 84"),
@@ -42,33 +38,21 @@ const SHARED_COLUMNS: [Column; SHARED] = [
 ];
 
 /// The columns of the finite ids.
-pub const FINITE_FEATURES: &[Column] = &FINITE;
-
-/// The columns of the endless id.
-pub const ENDLESS_FEATURES: &[Column] = &ENDLESS;
-
-const FINITE: [Column; GOAL + 3] = with_shared([
-    column("origin_shown", "1 if the path's first tile is seen"),
-    column("origin_x", "column of the path's first tile, divided by 6; 0 if it is not seen"),
-    column("origin_y", "row of the path's first tile, divided by 6; 0 if it is not seen"),
-    column("goal_shown", "1 if the goal is seen"),
-    column("goal_x", "column of the goal, divided by 6; 0 if it is not seen"),
-    column("goal_y", "row of the goal, divided by 6; 0 if it is not seen"),
-]);
-
-/// The shared columns, followed by an id's own columns and empty ones.
-const fn with_shared<const OWN: usize, const ALL: usize>(own: [Column; OWN]) -> [Column; ALL] {
-    let mut all = [column("", ""); ALL];
-    let mut place = 0;
-    while place < SHARED + OWN {
-        all[place] = if place < SHARED { SHARED_COLUMNS[place] } else { own[place - SHARED] };
-        place += 1;
-    }
-    all
+pub fn finite_features() -> &'static [Column] {
+    let own = [
+        column("origin_shown", "1 if the path's first tile is seen"),
+        column("origin_x", "column of the path's first tile, divided by 6; 0 if it is not seen"),
+        column("origin_y", "row of the path's first tile, divided by 6; 0 if it is not seen"),
+        column("goal_shown", "1 if the goal is seen"),
+        column("goal_x", "column of the goal, divided by 6; 0 if it is not seen"),
+        column("goal_y", "row of the goal, divided by 6; 0 if it is not seen"),
+    ];
+    [SHARED_COLUMNS.as_slice(), &own].concat().leak()
 }
 
-const ENDLESS: [Column; PAST_PATH + SCREEN_TILES] = {
-    let mut columns = with_shared([
+/// The columns of the endless id.
+pub fn endless_features() -> &'static [Column] {
+    let own = [
         column("stamina_shown", "1 if the stamina bar is seen"),
         column("stamina", "green share of the stamina bar; 0 if it is not seen"),
         column("background_shift", "tiles that the background has scrolled to the left; 0 if it is not seen"),
@@ -76,29 +60,13 @@ const ENDLESS: [Column; PAST_PATH + SCREEN_TILES] = {
             "past_shift",
             "offset in tiles of column 0 of the past path to the left of the screen; 0 if none is seen",
         ),
-    ]);
-    let mut tile = 0;
-    while tile < SCREEN_TILES {
-        let name = PAST_NAMES[tile / GRID as usize][tile % GRID as usize];
-        columns[PAST_PATH + tile] =
-            column(name, "1 if the past path's tile in this column and row of the screen is seen");
-        tile += 1;
-    }
-    columns
-};
-
-macro_rules! past_names {
-    ($($column:literal)*) => {
-        [$([
-            concat!("past_", $column, "_0"), concat!("past_", $column, "_1"), concat!("past_", $column, "_2"),
-            concat!("past_", $column, "_3"), concat!("past_", $column, "_4"), concat!("past_", $column, "_5"),
-            concat!("past_", $column, "_6"),
-        ]),*]
-    };
+    ];
+    let past_path = (0..SCREEN_COLUMNS).flat_map(|x| (0..GRID).map(move |y| format!("past_{x}_{y}").leak()));
+    let past_path: Vec<Column> = past_path
+        .map(|name| column(name, "1 if the past path's tile in this column and row of the screen is seen"))
+        .collect();
+    [SHARED_COLUMNS.as_slice(), &own, &past_path].concat().leak()
 }
-
-/// Names of the past path's feature columns, by column and row on the screen.
-const PAST_NAMES: [[&str; GRID as usize]; SCREEN_COLUMNS] = past_names!(0 1 2 3 4 5 6 7);
 
 impl State {
     /// Writes the feature observation.

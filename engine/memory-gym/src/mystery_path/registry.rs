@@ -3,7 +3,7 @@
 //! Source: `default_reset_parameters` of the original. The original checks no values. The limits here are wide enough for every
 //! use, and narrow enough that no value breaks the rules or needs much memory.
 
-use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
+use super::features::{endless_features, finite_features};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
 use std::sync::LazyLock;
 
@@ -128,7 +128,7 @@ pub static IDS: LazyLock<[(EnvSpec, Variant); 3]> = LazyLock::new(|| {
     let grid = spec("MysteryPath-Grid-v0", "Mystery Path with turning and walking from tile to tile", TURN_AND_WALK);
     let summary = "Follow an endless invisible path; a fall before the farthest column, or twice at the same tile, ends the episode";
     let endless = spec("Endless-MysteryPath-v0", summary, FOLLOW);
-    let (info, features, metric) = (FINITE_INFO, FINITE_FEATURES, Metric::TASK_PROGRESS);
+    let (info, features, metric) = (FINITE_INFO, finite_features(), Metric::TASK_PROGRESS);
     [
         (EnvSpec { info, features, metric, parameters: MYSTERY_PATH, ..free }, Variant::Free),
         (EnvSpec { info, features, metric, parameters: MYSTERY_PATH_GRID, render_fps: 3, ..grid }, Variant::Grid),
@@ -137,7 +137,7 @@ pub static IDS: LazyLock<[(EnvSpec, Variant); 3]> = LazyLock::new(|| {
                 ground_truth: GROUND_TRUTH,
                 ground_truth_is_integer: true,
                 info: ENDLESS_INFO,
-                features: ENDLESS_FEATURES,
+                features: endless_features(),
                 parameters: ENDLESS_MYSTERY_PATH,
                 metric: Metric { name: "tiles_visited", label: "Tiles" },
                 learnt: None,

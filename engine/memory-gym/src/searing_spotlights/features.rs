@@ -10,7 +10,7 @@ use endless_gym_core::envs::Column;
 pub(super) const COINS: usize = 8;
 pub(super) const SPOTLIGHTS: usize = 16;
 
-/// Indices of the columns in [`FEATURES`].
+/// Indices of the columns in [`columns`].
 pub(super) const AGENT: usize = 0;
 pub(super) const HEALTH: usize = 5;
 pub(super) const HIT: usize = 6;
@@ -20,38 +20,6 @@ pub(super) const LIGHT: usize = 10;
 pub(super) const EXIT: usize = 11;
 pub(super) const COIN: usize = 15;
 pub(super) const SPOTLIGHT: usize = COIN + 3 * COINS;
-
-macro_rules! coin {
-    ($number:literal) => {
-        [
-            column(
-                concat!("coin_", $number, "_seen"),
-                "1 if this coin's centre is seen; only coins that are seen are numbered",
-            ),
-            column(concat!("coin_", $number, "_x"), "x of its centre, as a share of the width"),
-            column(concat!("coin_", $number, "_y"), "y of its centre, as a share of the height"),
-        ]
-    };
-}
-
-macro_rules! spotlights {
-    ($($number:literal)*) => {
-        [$([
-            column(
-                concat!("spotlight_", $number, "_radius"),
-                "radius of a lit circle that overlaps the screen, as a share of the width; 0 for none",
-            ),
-            column(
-                concat!("spotlight_", $number, "_x"),
-                "x of its centre, as a share of the width; may lie off the screen",
-            ),
-            column(
-                concat!("spotlight_", $number, "_y"),
-                "y of its centre, as a share of the height; may lie off the screen",
-            ),
-        ]),*]
-    };
-}
 
 const FIRST: [Column; COIN] = [
     column("agent_seen", "1 if the agent's centre is seen"),
@@ -71,29 +39,33 @@ const FIRST: [Column; COIN] = [
     column("exit_open", "1 if the exit is seen and open"),
 ];
 
-const COIN_COLUMNS: [[Column; 3]; COINS] =
-    [coin!(0), coin!(1), coin!(2), coin!(3), coin!(4), coin!(5), coin!(6), coin!(7)];
+/// Names and descriptions of the columns of one object.
+type Parts = [(&'static str, &'static str); 3];
 
-const SPOTLIGHT_COLUMNS: [[Column; 3]; SPOTLIGHTS] = spotlights!(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15);
+const COIN_PARTS: Parts = [
+    ("seen", "1 if this coin's centre is seen; only coins that are seen are numbered"),
+    ("x", "x of its centre, as a share of the width"),
+    ("y", "y of its centre, as a share of the height"),
+];
 
-const COUNT: usize = SPOTLIGHT + 3 * SPOTLIGHTS;
+const SPOTLIGHT_PARTS: Parts = [
+    ("radius", "radius of a lit circle that overlaps the screen, as a share of the width; 0 for none"),
+    ("x", "x of its centre, as a share of the width; may lie off the screen"),
+    ("y", "y of its centre, as a share of the height; may lie off the screen"),
+];
 
 /// The columns. An object counts as seen if its centre is on the screen and either not in the dark or within a lit circle.
-pub const FEATURES: &[Column] = &{
-    let mut columns = [FIRST[0]; COUNT];
-    let mut at = 0;
-    while at < COUNT {
-        columns[at] = if at < COIN {
-            FIRST[at]
-        } else if at < SPOTLIGHT {
-            COIN_COLUMNS.as_flattened()[at - COIN]
-        } else {
-            SPOTLIGHT_COLUMNS.as_flattened()[at - SPOTLIGHT]
+pub fn columns() -> &'static [Column] {
+    let numbered = |kind: &'static str, count, parts: Parts| {
+        let columns = move |number| {
+            parts.map(|(part, description)| column(format!("{kind}_{number}_{part}").leak(), description))
         };
-        at += 1;
-    }
-    columns
-};
+        (0..count).flat_map(columns)
+    };
+    let coins = numbered("coin", COINS, COIN_PARTS);
+    let spotlights = numbered("spotlight", SPOTLIGHTS, SPOTLIGHT_PARTS);
+    FIRST.into_iter().chain(coins).chain(spotlights).collect::<Vec<_>>().leak()
+}
 
 impl State {
     /// Writes the feature observation.

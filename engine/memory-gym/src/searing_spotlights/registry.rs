@@ -3,7 +3,7 @@
 //! Source: `default_reset_parameters` of the original. The original checks no values. The limits here are wide enough for every
 //! use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
 
-use super::features::FEATURES;
+use super::features;
 use super::parameters::{MAX_AGENT_SCALE, MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use std::sync::LazyLock;
 
@@ -215,7 +215,7 @@ pub static IDS: LazyLock<[(EnvSpec, Variant); 2]> = LazyLock::new(|| {
     let finite = spec("SearingSpotlights-v0", summary, MOVE);
     let summary = "Collect one coin after the other in the dark, without being hit by moving spotlights";
     let endless = spec("Endless-SearingSpotlights-v0", summary, MOVE);
-    let (features, keeps_state, ground_truth) = (FEATURES, true, GROUND_TRUTH);
+    let (features, keeps_state, ground_truth) = (features::columns(), true, GROUND_TRUTH);
     let (info, parameters, metric) = (FINITE_INFO, SEARING_SPOTLIGHTS, Metric::TASK_PROGRESS);
     let types = OriginalTypes { numpy_floats: &["coins_collected"], ..OriginalTypes::default() };
     let finite = EnvSpec { info, types, features, keeps_state, parameters, metric, ..finite };
