@@ -2,7 +2,7 @@
 
 use arbitrary::{Result, Unstructured};
 use endless_gym::environments;
-use endless_gym_core::batch::{Block, zeroed};
+use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs::{ActionSpace, EnvSpec};
 use endless_gym_core::pool::{
     Autoreset, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
@@ -53,6 +53,9 @@ pub(crate) fn play(pool: &mut Pool, blocks: &mut [Block], input: &mut Unstructur
             _ => space.branches().iter().map(|count| input.int_in_range(0..=count - 1)).collect::<Result<_>>()?,
         };
         pool.step(&action, blocks).expect("an action in range is played");
+        let batch = Batch::new(pool.layout(), blocks);
+        assert!(batch.reward().iter().all(|reward| reward.is_finite()), "{:?}", batch.reward());
+        assert!(batch.features().iter().all(|feature| feature.is_finite()), "{:?}", batch.features());
     }
     view(pool);
     Ok(())

@@ -2,16 +2,14 @@
 
 use std::sync::{Arc, LazyLock};
 
-use proptest::prelude::*;
-use proptest::test_runner::contextualize_config;
 use serde_json::{Map, Value as Json, json};
 
 use super::features::{AGENT, COIN, EXIT, HEALTH, HIT, LAST_ACTION, LIGHT, SPOTLIGHT};
 use super::{Assets, IDS, MAX_SPOTLIGHTS, SearingSpotlights, Variant};
 use crate::screen::{FRAME, SCREEN};
-use endless_gym_core::envs::{EnvSpec, Environment, Parameter, ParameterKind};
+use endless_gym_core::envs::{EnvSpec, Environment};
 use endless_gym_core::random::Generator;
-use endless_gym_core::raster::{Canvas, Surface};
+use endless_gym_core::raster::Canvas;
 
 static FINITE: LazyLock<&EnvSpec> = LazyLock::new(|| &IDS[0].0);
 static ENDLESS: LazyLock<&EnvSpec> = LazyLock::new(|| &IDS[1].0);
@@ -62,63 +60,6 @@ fn walk(environment: &mut SearingSpotlights, random: &mut Generator, to: (i32, i
         }
     }
     panic!("nothing at {to:?}");
-}
-
-/// A value within the option's limits, often at one of them.
-fn any_value(parameter: &Parameter) -> BoxedStrategy<Json> {
-    match parameter.kind {
-        ParameterKind::Choice { choices, .. } => prop::sample::select(choices).prop_map(Json::from).boxed(),
-        ParameterKind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
-        ParameterKind::Int { default, min, max } => {
-            prop_oneof![Just(min), Just(max), Just(default), (min.max(-9)..=max.min(9))].prop_map(Json::from).boxed()
-        }
-        ParameterKind::Float { default, min, max } => {
-            prop_oneof![Just(min), Just(max), Just(default), min..=max].prop_map(Json::from).boxed()
-        }
-        ParameterKind::IntList { min, max, .. } => prop::collection::vec(min..=max, 1..4).prop_map(Json::from).boxed(),
-    }
-}
-
-fn any_options(spec: &'static EnvSpec) -> impl Strategy<Value = Map<String, Json>> {
-    let options: Vec<_> = spec
-        .parameters
-        .iter()
-        .map(|parameter| prop::option::weighted(0.4, any_value(parameter)).prop_map(|value| (parameter.name, value)))
-        .collect();
-    options
-        .prop_map(|options| options.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect())
-}
-
-fn any_episodes() -> impl Strategy<Value = (&'static EnvSpec, Vec<Map<String, Json>>)> {
-    prop_oneof![Just(*FINITE), Just(*ENDLESS)]
-        .prop_flat_map(|spec| (Just(spec), prop::collection::vec(any_options(spec), 1..4)))
-}
-
-proptest! {
-    #![proptest_config(contextualize_config(ProptestConfig::with_cases(150)))]
-
-    #[test]
-    fn any_options_play((spec, episodes) in any_episodes(), seed: u64, steps in 0..12_usize) {
-        let mut random = Generator::from_seed(seed);
-        let mut environment = SearingSpotlights::new(&assets(spec, &episodes[0]));
-        for options in &episodes {
-            environment.reset(&assets(spec, options), &mut random);
-            for step in 0..=steps {
-                let state = environment.state.clone();
-                prop_assert_eq!(frame(&environment, 0), frame(&environment, 255), "must not depend on the canvas");
-                let mut view = Surface::new(SCREEN, SCREEN);
-                environment.draw_ground_truth(&mut view.canvas());
-                prop_assert_eq!(&environment.state, &state, "drawing changed the state");
-                prop_assert!(features(&environment).iter().all(|value| value.is_finite()));
-                prop_assert!(state.spotlights.len() <= MAX_SPOTLIGHTS);
-                let transition = environment.step(&[(seed % 3) as i32, (step % 3) as i32], &mut random);
-                prop_assert!(transition.reward.is_finite());
-                let mut info = vec![f64::INFINITY; spec.info.len()];
-                environment.info(&mut info);
-                prop_assert!(info.iter().all(|value| !value.is_infinite()));
-            }
-        }
-    }
 }
 
 #[test]
