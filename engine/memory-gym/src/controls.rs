@@ -2,7 +2,7 @@
 
 use endless_gym_core::envs::{ActionBranch, ActionSpace, Choice, Column, EnvSpec, InfoColumn, Parameter};
 
-use crate::screen::FRAME;
+use crate::screen::{FRAME, SCREEN};
 
 /// The specification of an id with frames, these actions, and a ground truth from 0 to 1.
 pub(crate) fn spec(id: &'static str, summary: &'static str, actions: &'static [ActionBranch]) -> EnvSpec {
@@ -19,6 +19,22 @@ pub(crate) fn spec(id: &'static str, summary: &'static str, actions: &'static [A
 pub(crate) const fn max_steps(default: i64) -> Parameter {
     Parameter::int("max_steps", default, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1.")
 }
+
+/// Maximum scale of the agent: a radius of 100 pixels.
+pub(crate) const MAX_AGENT_SCALE: f64 = 4.0;
+
+/// The scale of an agent that some ids move on a grid.
+pub(crate) const AGENT_SCALE: Parameter = Parameter::float(
+    "agent_scale",
+    0.25,
+    0.0,
+    MAX_AGENT_SCALE,
+    "Size of the agent; 0.25 is a radius of 6 pixels. No effect on a grid.",
+);
+
+/// The speed of the agent. A step is at most as long as the screen is wide, so that the agent of an endless path never skips a segment.
+pub(crate) const AGENT_SPEED: Parameter =
+    Parameter::float("agent_speed", 3.0, 0.0, SCREEN as f64, "Speed of the agent in pixels per step.");
 
 /// A column of the ground truth or of the features.
 pub(crate) const fn column(name: &'static str, description: &'static str) -> Column {

@@ -30,8 +30,6 @@ pub enum Locomotion {
     Grid,
 }
 
-/// Maximum scale of the agent: a radius of 100 pixels.
-pub const MAX_AGENT_SCALE: f64 = 4.0;
 /// Maximum duration and delay in steps.
 pub const MAX_DURATION: i64 = 1000;
 /// Maximum number of commands of an id that shows them.

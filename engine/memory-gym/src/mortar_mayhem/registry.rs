@@ -5,21 +5,12 @@
 
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
-use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION, Variant};
+use super::parameters::{Locomotion, MAX_COMMANDS, MAX_DURATION, Variant};
 use std::sync::LazyLock;
 
-use crate::controls::{MOVE, TURN_AND_WALK, column, float, integer, max_steps, spec};
+use crate::controls::{AGENT_SCALE, AGENT_SPEED, MOVE, TURN_AND_WALK, column, float, integer, max_steps, spec};
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Learnt, Metric, OriginalTypes, Parameter, RewardType};
 
-const AGENT_SCALE: Parameter = Parameter::float(
-    "agent_scale",
-    0.25,
-    0.0,
-    MAX_AGENT_SCALE,
-    "Size of the agent; 0.25 is a radius of 6 pixels. No effect on a grid.",
-);
-const AGENT_SPEED: Parameter =
-    Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const ARENA_SIZE: Parameter = Parameter::int("arena_size", 5, 2, 6, "Tiles along a side of the arena.");
 const ALLOWED_COMMANDS: &str = "Number of different commands, from the start of this list: right, down, \
                                 left, up, stay, right down, right up, left down, left up.";

@@ -5,8 +5,9 @@ use serde::{Deserialize, Serialize};
 use super::commands::{COMMANDS, Command};
 use super::config::Config;
 use super::display_schedule::DisplaySchedule;
-use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_DURATION, Parameters};
+use super::parameters::{Locomotion, MAX_DURATION, Parameters};
 use crate::character::Character;
+use crate::controls::MAX_AGENT_SCALE;
 use endless_gym_core::envs::Progress;
 
 /// The character that frames show after an episode's first frame.

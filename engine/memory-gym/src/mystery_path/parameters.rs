@@ -18,8 +18,6 @@ pub enum Variant {
 
 /// The original's default scale of the agent: a radius of 6 pixels.
 pub const DEFAULT_AGENT_SCALE: f64 = 0.25;
-/// Maximum scale of the agent: a radius of 100 pixels.
-pub const MAX_AGENT_SCALE: f64 = 4.0;
 /// Maximum `stamina_level`.
 pub const MAX_STAMINA: i64 = 1_000_000_000;
 

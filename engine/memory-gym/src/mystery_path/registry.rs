@@ -4,27 +4,16 @@
 //! use, and narrow enough that no value breaks the rules or needs much memory.
 
 use super::features::{endless_features, finite_features};
-use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
+use super::parameters::{MAX_STAMINA, Variant};
 use std::sync::LazyLock;
 
-use crate::controls::{FOLLOW, MOVE, TURN_AND_WALK, column, integer, max_steps, spec};
-use crate::screen::SCREEN;
+use crate::controls::{AGENT_SCALE, AGENT_SPEED, FOLLOW, MOVE, TURN_AND_WALK, column, integer, max_steps, spec};
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, Parameter};
 
 const fn reward_path_progress(default: f64) -> Parameter {
     Parameter::reward("reward_path_progress", default, "Reward for reaching a tile of the path for the first time.")
 }
 
-const AGENT_SCALE: Parameter = Parameter::float(
-    "agent_scale",
-    DEFAULT_AGENT_SCALE,
-    0.0,
-    MAX_AGENT_SCALE,
-    "Size of the agent; 0.25 is a radius of 6 pixels. No effect on a grid.",
-);
-// A step is at most as long as the screen is wide, so that the endless agent never skips a segment.
-const AGENT_SPEED: Parameter =
-    Parameter::float("agent_speed", 3.0, 0.0, SCREEN as f64, "Speed of the agent in pixels per step.");
 const CARDINAL_ORIGIN_CHOICE: Parameter = Parameter::list(
     "cardinal_origin_choice",
     &[0, 1, 2, 3],

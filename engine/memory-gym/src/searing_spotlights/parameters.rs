@@ -19,9 +19,6 @@ pub const MAX_SPOTLIGHTS: usize = 1000;
 /// Maximum number of coins at a time.
 pub const MAX_COINS: usize = 100;
 
-/// Maximum size of the agent.
-pub const MAX_AGENT_SCALE: f64 = 4.0;
-
 /// Maximum radius of a spotlight in pixels: more than the screen's diagonal.
 pub const MAX_SPOT_RADIUS: i32 = 256;
 

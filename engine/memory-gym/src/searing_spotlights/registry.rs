@@ -4,10 +4,10 @@
 //! use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
 
 use super::features;
-use super::parameters::{MAX_AGENT_SCALE, MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
+use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use std::sync::LazyLock;
 
-use crate::controls::{MOVE, column, float, integer, max_steps, spec};
+use crate::controls::{AGENT_SPEED, MAX_AGENT_SCALE, MOVE, column, float, integer, max_steps, spec};
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn, Metric, OriginalTypes, Parameter};
 
 const fn initial_spawns(default: i64) -> Parameter {
@@ -67,8 +67,6 @@ const LIGHT_THRESHOLD: Parameter = Parameter::int(
 const COIN_SCALE: Parameter =
     Parameter::float("coin_scale", 0.375, 0.0, 8.0, "Size of a coin; 1 is a radius of 10 pixels.");
 const COINS_VISIBLE: Parameter = Parameter::bool("coins_visible", false, "Whether coins are visible in the dark.");
-const AGENT_SPEED: Parameter =
-    Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const AGENT_SCALE: Parameter =
     Parameter::float("agent_scale", 0.25, 0.0, MAX_AGENT_SCALE, "Size of the agent; 0.25 is a radius of 6 pixels.");
 const AGENT_VISIBLE: Parameter = Parameter::bool("agent_visible", false, "Whether the agent is visible in the dark.");

@@ -4,9 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use super::circles::Circle;
 use super::config::{BAR_HEIGHT, Config};
-use super::parameters::{MAX_AGENT_SCALE, MAX_SPOTLIGHTS, Parameters};
+use super::parameters::{MAX_SPOTLIGHTS, Parameters};
 use super::spotlight::Spotlight;
 use crate::character::{Character, CharacterSize};
+use crate::controls::MAX_AGENT_SCALE;
 use crate::screen::SCREEN;
 use endless_gym_core::envs::Progress;
 
