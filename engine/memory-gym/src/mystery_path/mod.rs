@@ -39,7 +39,7 @@ pub use scene::Scene;
 pub use state::State;
 
 use crate::shared_methods::shared_methods;
-use endless_gym_core::envs::{Environment, Expert, InvalidState, ResetParameters};
+use endless_gym_core::envs::{Environment, Expert, ResetParameters};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 
@@ -51,17 +51,10 @@ pub struct MysteryPath {
 }
 
 impl Environment for MysteryPath {
-    shared_methods!();
+    shared_methods!(all_of_assets_and_state);
 
     fn new(assets: &Arc<Assets>) -> Self {
         MysteryPath { assets: Arc::clone(assets), state: State::default() }
-    }
-
-    fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
-        if !Arc::ptr_eq(&self.assets, assets) {
-            self.assets = Arc::clone(assets);
-        }
-        self.state.reset(&assets.config, random);
     }
 
     fn scene(&self) -> Scene {
@@ -72,24 +65,11 @@ impl Environment for MysteryPath {
         scene.damage_since(shown, assets).repair(canvas, |canvas| scene.paint(assets, canvas));
     }
 
-    fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
-        self.assets.draw_ground_truth(&self.state, canvas);
-    }
-
     fn ground_truth(&self, out: &mut [f64]) {
         out.fill(0.0);
         if self.assets.config.variant == Variant::Endless {
             out[self.state.endless.direction as usize] = 1.0;
         }
-    }
-
-    fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
-        if !state.is_valid(&assets.config) {
-            return Err(InvalidState);
-        }
-        self.assets = Arc::clone(assets);
-        self.state = state;
-        Ok(())
     }
 
     fn info(&self, out: &mut [f64]) {

@@ -52,7 +52,7 @@ pub use scene::Scene;
 pub use state::State;
 
 use crate::shared_methods::shared_methods;
-use endless_gym_core::envs::{Environment, Expert, InvalidState, ResetParameters};
+use endless_gym_core::envs::{Environment, Expert, ResetParameters};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
 
@@ -64,17 +64,10 @@ pub struct SearingSpotlights {
 }
 
 impl Environment for SearingSpotlights {
-    shared_methods!();
+    shared_methods!(all_of_assets_and_state);
 
     fn new(assets: &Arc<Assets>) -> Self {
         SearingSpotlights { assets: Arc::clone(assets), state: State::new() }
-    }
-
-    fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
-        if !Arc::ptr_eq(&self.assets, assets) {
-            self.assets = Arc::clone(assets);
-        }
-        self.state.reset(&assets.config, random);
     }
 
     fn scene(&self) -> Scene {
@@ -85,23 +78,10 @@ impl Environment for SearingSpotlights {
         scene.repaint(shown, assets, canvas);
     }
 
-    fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
-        self.assets.draw_ground_truth(&self.state, canvas);
-    }
-
     fn ground_truth(&self, out: &mut [f64]) {
         if self.assets.config.variant.endless {
             out.copy_from_slice(&self.state.ground_truth());
         }
-    }
-
-    fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
-        if !state.is_valid(&assets.config) {
-            return Err(InvalidState);
-        }
-        self.assets = Arc::clone(assets);
-        self.state = state;
-        Ok(())
     }
 
     fn info(&self, out: &mut [f64]) {
