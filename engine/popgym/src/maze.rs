@@ -31,16 +31,11 @@ impl Maze {
     pub fn seed(&mut self, seed: u64) {
         // The original refuses seeds of more than 32 bits.
         let of_numpy = seed as u32;
-        match &mut self.random {
-            Some((python, numpy)) => {
-                python.seed_as_python(seed);
-                numpy.seed_as_numpy(of_numpy);
-            }
-            random => {
-                let python = MersenneTwister::from_python_seed(seed);
-                *random = Some((python, MersenneTwister::from_numpy_seed(of_numpy)));
-            }
-        }
+        let (python, numpy) = self.random.get_or_insert_with(|| {
+            (MersenneTwister::from_python_seed(seed), MersenneTwister::from_numpy_seed(of_numpy))
+        });
+        python.seed_as_python(seed);
+        numpy.seed_as_numpy(of_numpy);
     }
 
     /// Makes a maze of so many rows and columns of cells. `random` seeds the maze's generators if nothing else has.
