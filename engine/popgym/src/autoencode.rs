@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, DECKS, Deck, Face, decks};
 use crate::ids::{INTEGER_ZERO, SUITS, levels, shape};
-use crate::pictures::{self, ALONE, PICTURE};
+use crate::pictures::{self, ALONE};
 
 /// Number of decks, and the reward.
 pub struct Parameters {
@@ -46,7 +46,6 @@ impl Task for Autoencode {
             ])),
             types: INTEGER_ZERO,
             arguments: &[DECKS],
-            picture: Some(PICTURE),
             ..EnvSpec::new("Autoencode", summary, ActionSpace::Discrete(4))
         }
     }

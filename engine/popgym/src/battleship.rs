@@ -11,7 +11,7 @@ use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{levels, shape};
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 const ARGUMENTS: &[Parameter] = &[
     Parameter::int("board_size", 10, 1, ROWS as i64, "rows and columns of the board"),
@@ -120,7 +120,6 @@ impl Task for Battleship {
             needs_previous_action: true,
             observation_space: Some(ObservationSpace::Discrete(2)),
             arguments: ARGUMENTS,
-            picture: Some(PICTURE),
             ..EnvSpec::new("Battleship", summary, ActionSpace::Discrete(1))
         }
     }

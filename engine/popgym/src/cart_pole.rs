@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::filter::{Filter, MAX_LENGTH, NOISE, noise, variance};
 use crate::ids::levels;
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 /// The last is only for noisy ones.
 const ARGUMENTS: &[Parameter] = &[
@@ -134,7 +134,6 @@ impl Task for CartPole {
             parameters: PARAMETERS,
             arguments: &ARGUMENTS[..2],
             render_fps: 50,
-            picture: Some(PICTURE),
             ..EnvSpec::new("PositionOnlyCartPole", summary, ActionSpace::Discrete(2))
         }
     }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, DECKS, Deck, Face, decks};
 use crate::ids::{INTEGER_ZERO, levels, numbered, shape};
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 const ARGUMENTS: &[Parameter] =
     &[DECKS, Parameter::choice("deck_type", "ranks", &["colors", "ranks"], "what makes two cards a pair")];
@@ -78,7 +78,6 @@ impl Task for Concentration {
             needs_previous_action: true,
             types: INTEGER_ZERO,
             arguments: ARGUMENTS,
-            picture: Some(PICTURE),
             ..EnvSpec::new("Concentration", summary, ActionSpace::Discrete(1))
         }
     }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, DECKS, Deck, Face, decks};
 use crate::ids::{levels, numbered, shape};
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 const ARGUMENTS: &[Parameter] = &[
     DECKS,
@@ -70,7 +70,6 @@ impl Task for CountRecall {
             features: FEATURES,
             ground_truth_is_integer: true,
             arguments: ARGUMENTS,
-            picture: Some(PICTURE),
             ..EnvSpec::new("CountRecall", summary, ActionSpace::Discrete(1))
         }
     }

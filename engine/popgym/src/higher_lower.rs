@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, DECKS, Deck, Face, decks};
 use crate::ids::{INTEGER_ZERO, levels};
-use crate::pictures::{self, ALONE, PICTURE};
+use crate::pictures::{self, ALONE};
 
 const HIGHER: i32 = 0;
 const LOWER: i32 = 1;
@@ -61,7 +61,6 @@ impl Task for HigherLower {
             markov_state: STATE,
             types: INTEGER_ZERO,
             arguments: &[DECKS],
-            picture: Some(PICTURE),
             ..EnvSpec::new("HigherLower", summary, ActionSpace::Discrete(2))
         }
     }

@@ -2,11 +2,13 @@
 
 use endless_gym_core::envs::{ActionBranch, Choice, Column, EnvSpec, OriginalTypes, ParameterError, RewardType, Task};
 
-/// The specifications of a family in its difficulties, which have these arguments. The id of `family` is the name of the original's class.
+use crate::pictures::PICTURE;
+
+/// The specifications of a family in its difficulties, which have these arguments and a picture. The id of `family` is the name of the original's class.
 pub fn levels<T: Task>(family: EnvSpec, arguments: [&str; 3]) -> Vec<EnvSpec> {
     let level = |(level, arguments)| -> Result<EnvSpec, ParameterError> {
         let id = format!("popgym-{}{level}-v0", family.id).leak();
-        let spec = EnvSpec { id, ..family.with_arguments(arguments)? };
+        let spec = EnvSpec { id, picture: Some(PICTURE), ..family.with_arguments(arguments)? };
         let parameters = T::parameters(&spec.reset_parameters(&Default::default())?);
         T::with_arguments(spec, &parameters)
     };

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::ids::{levels, numbered, shape};
 use crate::maze::{Maze, Place, connected};
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 const ARGUMENTS: &[Parameter] = &[
     Parameter::list("maze_dims", &[10, 10], 6, 62, "height and width of the maze, two even numbers"),
@@ -137,7 +137,6 @@ impl Task for Labyrinth {
             ground_truth: GROUND_TRUTH,
             ground_truth_is_integer: true,
             arguments: ARGUMENTS,
-            picture: Some(PICTURE),
             ..EnvSpec::new("LabyrinthEscape", summary, ActionSpace::Discrete(4))
         }
     }

@@ -9,7 +9,7 @@ use endless_gym_core::raster::{Canvas, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{levels, shape};
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 const DIFFICULTY: Parameter =
     Parameter::choice("difficulty", "easy", &["easy", "medium", "hard"], "size of the board and number of mines");
@@ -49,7 +49,6 @@ impl Task for MineSweeper {
             features: FEATURES,
             needs_previous_action: true,
             arguments: &[DIFFICULTY],
-            picture: Some(PICTURE),
             ..EnvSpec::new("MineSweeper", summary, ActionSpace::Discrete(1))
         }
     }

@@ -9,7 +9,7 @@ use endless_gym_core::raster::Canvas;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{levels, numbered, shape};
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 const ARGUMENTS: &[Parameter] = &[
     Parameter::int("num_bandits", 10, 1, 1000, "number of arms"),
@@ -42,7 +42,6 @@ impl Task for MultiarmedBandit {
             needs_previous_action: true,
             observation_space: Some(ObservationSpace::Discrete(2)),
             arguments: ARGUMENTS,
-            picture: Some(PICTURE),
             ..EnvSpec::new("MultiarmedBandit", "Find the arms that pay best", ActionSpace::Discrete(1))
         }
     }

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::filter::{Filter, MAX_LENGTH, NOISE, noise, variance};
 use crate::ids::levels;
-use crate::pictures::{self, PICTURE};
+use crate::pictures;
 
 /// The last is only for noisy ones.
 const ARGUMENTS: &[Parameter] =
@@ -101,7 +101,6 @@ impl Task for Pendulum {
             parameters: PARAMETERS,
             arguments: &ARGUMENTS[..2],
             render_fps: 30,
-            picture: Some(PICTURE),
             ..EnvSpec::new("PositionOnlyPendulum", summary, ActionSpace::bounded(&[-MAX_TORQUE], &[MAX_TORQUE]))
         }
     }

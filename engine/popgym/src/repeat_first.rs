@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, DECKS, Deck, Face, decks};
 use crate::ids::{SUITS, levels};
-use crate::pictures::{self, ALONE, PICTURE};
+use crate::pictures::{self, ALONE};
 
 /// Number of decks, and the reward.
 pub struct Parameters {
@@ -41,7 +41,6 @@ impl Task for RepeatFirst {
             observation_space: Some(ObservationSpace::Discrete(4)),
             markov_state: STATE,
             arguments: &[DECKS],
-            picture: Some(PICTURE),
             ..EnvSpec::new("RepeatFirst", summary, ActionSpace::Discrete(4))
         }
     }

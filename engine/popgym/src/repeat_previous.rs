@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::deck::{DECK, DECKS, Deck, Face, decks};
 use crate::ids::{INTEGER_ZERO, SUITS, levels, shape};
-use crate::pictures::{self, ALONE, PICTURE};
+use crate::pictures::{self, ALONE};
 
 const ARGUMENTS: &[Parameter] =
     &[DECKS, Parameter::int("k", 4, 1, 3275, "which card to name: 1 is the one that is shown")];
@@ -43,7 +43,6 @@ impl Task for RepeatPrevious {
             observation_space: Some(ObservationSpace::Discrete(4)),
             types: INTEGER_ZERO,
             arguments: ARGUMENTS,
-            picture: Some(PICTURE),
             ..EnvSpec::new("RepeatPrevious", summary, ActionSpace::Discrete(4))
         }
     }
