@@ -133,10 +133,7 @@ mod mapped {
 #[cfg(test)]
 mod tests {
     use super::super::block::{BLOCK_BYTES, blocks_for};
-    use super::super::view::Batch;
     use super::*;
-    use crate::pool::{Pool, PoolConfig, ResetRequest, Threads};
-    use crate::toy::toys;
 
     /// Sizes around 4 MiB and around a multiple of a huge page.
     const SIZES: [usize; 8] = [0, 64, 4096, (4 << 20) - 64, 4 << 20, (4 << 20) + 64, (6 << 20) - 64, 21_700_000];
@@ -166,25 +163,6 @@ mod tests {
             let large = bytes >= mapped::LEAST_BYTES;
             let buffer = BatchBuffer::new(blocks_for(bytes));
             assert_eq!(matches!(buffer.0, Memory::Mapped(_)), large && has_huge_pages, "{bytes} bytes");
-        }
-    }
-
-    #[test]
-    fn a_pool_writes_the_same_batch_into_buffers_and_vecs() {
-        for num_envs in [2, 256] {
-            let config = PoolConfig::new("Toy-v0", num_envs);
-            let mut pools = [(); 2].map(|()| Pool::new(toys(), &config, &Threads::new(1).unwrap()).unwrap());
-            let layout = pools[0].layout().clone();
-            let (mut buffer, mut vec) = (BatchBuffer::new(layout.blocks()), zeroed(layout.blocks()));
-            pools[0].reset(ResetRequest::Seed(5), &mut buffer).unwrap();
-            pools[1].reset(ResetRequest::Seed(5), &mut vec).unwrap();
-            for step in 0..20 {
-                let actions: Vec<i32> = (0..num_envs).map(|env| ((env + step) % 4) as i32).collect();
-                pools[0].step(&actions, &mut buffer).unwrap();
-                pools[1].step(&actions, &mut vec).unwrap();
-                let (mapped, plain) = (Batch::new(&layout, &buffer), Batch::new(&layout, &vec));
-                assert!(mapped.bytes() == plain.bytes(), "{num_envs} environments, step {step}");
-            }
         }
     }
 }

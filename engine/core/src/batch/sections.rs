@@ -307,19 +307,6 @@ mod tests {
     use super::*;
     use crate::toy::toys;
 
-    #[test]
-    fn a_name_finds_its_section() {
-        fn check<S: SectionTable>() {
-            for section in S::ALL {
-                assert_eq!(S::from_name(section.name()), Some(*section));
-            }
-            assert_eq!(S::from_name("rewards"), None);
-            assert_eq!(S::from_name(""), None);
-        }
-        check::<BatchSection>();
-        check::<ActionSection>();
-    }
-
     /// Each `final_*` section has the number type and the shape of its original.
     #[test]
     fn final_sections_equal_their_originals() {
@@ -333,28 +320,6 @@ mod tests {
                 assert_eq!(section.row(), original.row());
                 assert_eq!(section.row_shape(spec, contents), original.row_shape(spec, contents));
                 assert_eq!(section.row_shape(spec, Contents { final_observation: false, ..contents }), None);
-            }
-        }
-    }
-
-    #[test]
-    fn shapes_fit_the_table() {
-        for spec in toys().specs() {
-            for stack in [1, 4] {
-                let frames = Some(Frames { stack, ..Frames::default() });
-                let contents = Contents { frames, features: true, state: true, final_observation: true };
-                for section in BatchSection::ALL {
-                    let shape = section.row_shape(spec, contents);
-                    assert!(shape.iter().all(|shape| section.row().admits(shape)), "{section} {shape:?}");
-                    assert!(shape.is_some() || !section.is_required());
-                }
-                let none = Contents::default();
-                for section in BatchSection::ALL {
-                    assert!(section.row_shape(spec, none).is_some() || !section.is_required(), "{section}");
-                }
-            }
-            for section in ActionSection::ALL {
-                assert!(section.row().admits(&section.row_shape(&spec.action_space, 3)), "{section}");
             }
         }
     }
