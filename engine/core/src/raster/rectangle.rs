@@ -71,15 +71,6 @@ impl Corners {
     }
 }
 
-/// A quarter of a circle, seen from its centre.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Quadrant {
-    TopLeft,
-    TopRight,
-    BottomLeft,
-    BottomRight,
-}
-
 impl Canvas<'_> {
     /// Draws a rectangle as `pygame.draw.rect` does.
     ///
@@ -138,21 +129,15 @@ impl Canvas<'_> {
         } else {
             self.draw_sides(color, &edges, &corners, width);
         }
-        for (quadrant, radius) in [
-            (Quadrant::TopRight, corners.top_right),
-            (Quadrant::TopLeft, corners.top_left),
-            (Quadrant::BottomLeft, corners.bottom_left),
-            (Quadrant::BottomRight, corners.bottom_right),
+        for (is_left, is_top, radius) in [
+            (false, true, corners.top_right),
+            (true, true, corners.top_left),
+            (true, false, corners.bottom_left),
+            (false, false, corners.bottom_right),
         ] {
-            let x = match quadrant {
-                Quadrant::TopLeft | Quadrant::BottomLeft => edges.left + radius,
-                Quadrant::TopRight | Quadrant::BottomRight => edges.right - radius + 1,
-            };
-            let y = match quadrant {
-                Quadrant::TopLeft | Quadrant::TopRight => edges.top + radius,
-                Quadrant::BottomLeft | Quadrant::BottomRight => edges.bottom - radius + 1,
-            };
-            self.draw_quadrant(color, quadrant, (x, y), radius, width);
+            let x = if is_left { edges.left + radius } else { edges.right - radius + 1 };
+            let y = if is_top { edges.top + radius } else { edges.bottom - radius + 1 };
+            self.draw_quadrant(color, (is_left, is_top), (x, y), radius, width);
         }
     }
 
@@ -198,46 +183,41 @@ impl Canvas<'_> {
     /// Draws the straight parts of a border between its round corners.
     fn draw_sides(&mut self, color: Rgb, edges: &Edges, corners: &Corners, width: i64) {
         let &Edges { left, top, right, bottom } = edges;
-        // Offsets to the middle of a side, so that its wide line covers the `width` outermost pixels.
-        let near = width / 2 - 1 + width % 2;
-        let far = width / 2;
-
-        // If two corners meet in a point, pygame only fills the gap between them.
-        let (start, end) = (left + corners.top_left, right - corners.top_right);
-        if start == end {
-            self.fill_block(start, top, start, top + width - 1, color);
-        } else {
-            self.stroke(color, (start, top + near), (end, top + near), width);
-        }
-        let (start, end) = (top + corners.top_left, bottom - corners.bottom_left);
-        if start == end {
-            self.fill_block(left, start, left + width - 1, start, color);
-        } else {
-            self.stroke(color, (left + near, start), (left + near, end), width);
-        }
-        let (start, end) = (left + corners.bottom_left, right - corners.bottom_right);
-        if start == end {
-            self.fill_block(start, bottom - width + 1, start, bottom, color);
-        } else {
-            self.stroke(color, (start, bottom - far), (end, bottom - far), width);
-        }
-        let (start, end) = (top + corners.top_right, bottom - corners.bottom_right);
-        if start == end {
-            self.fill_block(right - width + 1, start, right, start, color);
-        } else {
-            self.stroke(color, (right - far, start), (right - far, end), width);
+        // Offsets from the middle of a side to the edges of its wide line, which covers the `width` outermost pixels.
+        let (near, far) = ((width - 1) / 2, width / 2);
+        for (is_level, start, end) in [
+            (true, (left + corners.top_left, top + near), (right - corners.top_right, top + near)),
+            (false, (left + near, top + corners.top_left), (left + near, bottom - corners.bottom_left)),
+            (true, (left + corners.bottom_left, bottom - far), (right - corners.bottom_right, bottom - far)),
+            (false, (right - far, top + corners.top_right), (right - far, bottom - corners.bottom_right)),
+        ] {
+            let (x, y) = start;
+            // If two corners meet in a point, pygame only fills the gap between them.
+            if start != end {
+                self.stroke(color, start, end, width);
+            } else if is_level {
+                self.fill_block(x, y - near, x, y + far, color);
+            } else {
+                self.fill_block(x - near, y, x + far, y, color);
+            }
         }
     }
 
-    /// Draws a quarter of a circle: filled for a `width` of 0, otherwise its border.
-    fn draw_quadrant(&mut self, color: Rgb, quadrant: Quadrant, center: (i64, i64), radius: i64, width: i64) {
+    /// Draws a quarter of a circle, to the left or right of its centre and above or below it: filled for a `width` of 0, otherwise its
+    /// border.
+    fn draw_quadrant(
+        &mut self,
+        color: Rgb,
+        (is_left, is_top): (bool, bool),
+        center: (i64, i64),
+        radius: i64,
+        width: i64,
+    ) {
         // The pixel at a distance from the centre; distances start at 1 in all directions.
-        let at = |x: i64, y: i64| match quadrant {
-            Quadrant::TopLeft => (center.0 - x, center.1 - y),
-            Quadrant::TopRight => (center.0 + x - 1, center.1 - y),
-            Quadrant::BottomLeft => (center.0 - x, center.1 + y - 1),
-            Quadrant::BottomRight => (center.0 + x - 1, center.1 + y - 1),
+        let along = |center: i64, distance: i64, is_before: bool| {
+            if is_before { center - distance } else { center + distance - 1 }
         };
+        let at = |x: i64, y: i64| (along(center.0, x, is_left), along(center.1, y, is_top));
         let mut fill = |(x0, y0): (i64, i64), (x1, y1): (i64, i64)| {
             self.fill_block(x0.min(x1), y0.min(y1), x0.max(x1), y0.max(y1), color);
         };
@@ -246,7 +226,6 @@ impl Canvas<'_> {
             return;
         }
         if width == 0 {
-            let is_top = matches!(quadrant, Quadrant::TopLeft | Quadrant::TopRight);
             // Above the centre, the columns extend one pixel beyond the centre line.
             let first = if is_top { 0 } else { 1 };
             for (near, far) in Octant::new(radius) {
@@ -256,10 +235,7 @@ impl Canvas<'_> {
             return;
         }
         // The quadrants differ in which of the two eighths owns the diagonal.
-        let owns_diagonal = match quadrant {
-            Quadrant::TopLeft | Quadrant::BottomRight => Eighth::Upright,
-            Quadrant::TopRight | Quadrant::BottomLeft => Eighth::Level,
-        };
+        let owns_diagonal = if is_left == is_top { Eighth::Upright } else { Eighth::Level };
         let inner_radius = radius - width;
         let mut inner = inner_radius;
         let mut thickness = width;
