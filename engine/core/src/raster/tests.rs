@@ -237,18 +237,6 @@ proptest! {
             }
         }
     }
-
-    #[test]
-    fn a_disc_is_the_filled_circle(radius in -2..80i32, center in (-90..120i32, -90..120i32), far in any_position()) {
-        let disc = Disc::new(radius);
-        for center in [center, far] {
-            let mut drawn = Surface::new(50, 40);
-            let mut filled = drawn.clone();
-            drawn.draw_circle([9, 8, 7], center, radius, 0);
-            filled.canvas().fill_disc([9, 8, 7], center, &disc);
-            prop_assert_eq!(&drawn, &filled);
-        }
-    }
 }
 
 proptest! {
@@ -317,14 +305,4 @@ fn the_bounds_of_a_sprite_are_tight() {
     assert_eq!(Sprite::new(&surface).bounds(), Rect::new(3, 2, 4, 5));
     surface.set_color_key(None);
     assert_eq!(Sprite::new(&surface).bounds(), Rect::new(0, 0, 10, 8));
-}
-
-#[test]
-fn pixels_lie_column_by_column() {
-    let mut surface = Surface::new(4, 3);
-    surface.draw_rect([1, 2, 3], Rect::new(2, 1, 1, 1), 0);
-    assert_eq!(surface.pixel(2, 1), Some([1, 2, 3]));
-    assert_eq!(surface.pixel(4, 0), None);
-    assert_eq!(surface.pixel(0, 3), None);
-    assert_eq!(surface.into_pixels()[(2 * 3 + 1) * 3..][..3], [1, 2, 3]);
 }
