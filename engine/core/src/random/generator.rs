@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::entropy::{EntropyError, entropy};
 use super::seed_sequence::SeedSequence;
-use super::ziggurat::{HEIGHT, INSIDE, INVERSE_TAIL, TAIL, WIDTH};
+use super::ziggurat::{HEIGHT, INSIDE, TAIL, WIDTH};
 
 /// Maximum number of redraws in rejection sampling, after which it takes a biased draw. numpy has no such limit. Fewer than
 /// half of the draws are rejected, so no seed reaches it, but a deserialised state could.
@@ -140,7 +140,8 @@ impl Generator {
     #[cold]
     fn normal_tail(&mut self, is_negative: bool) -> f64 {
         loop {
-            let x = -INVERSE_TAIL * (-self.random()).ln_1p();
+            // numpy multiplies by the reciprocal, which rounds differently from a division.
+            let x = -(1.0 / TAIL) * (-self.random()).ln_1p();
             let y = -(-self.random()).ln_1p();
             if y + y > x * x {
                 return if is_negative { -(TAIL + x) } else { TAIL + x };
