@@ -1,5 +1,6 @@
 //! The threads that step a pool's environments.
 
+#[cfg(feature = "threads")]
 mod pinning;
 #[cfg(feature = "threads")]
 mod shares;
@@ -137,6 +138,15 @@ impl Threads {
         lock(&failed).take().map_or(Ok(()), Err)
     }
 
+    /// Binds the calling thread to one CPU: number `number` of its affinity mask. Threads that it starts inherit that.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`pin`](Self::pin).
+    pub fn pin_caller(number: usize) -> Result<(), PoolError> {
+        pinning::pin(pinning::cpus(number.saturating_add(1))?[number])
+    }
+
     /// Number of threads that step environments at the same time, including the calling one.
     pub fn count(&self) -> usize {
         1 + self.workers.as_ref().map_or(0, |workers| workers.count())
@@ -162,17 +172,6 @@ impl Threads {
     }
 }
 
-impl Threads {
-    /// Binds the calling thread to one CPU: number `number` of its affinity mask. Threads that it starts inherit that.
-    ///
-    /// # Errors
-    ///
-    /// Those of [`pin`](Self::pin).
-    pub fn pin_caller(number: usize) -> Result<(), PoolError> {
-        pinning::pin(pinning::cpus(number.saturating_add(1))?[number])
-    }
-}
-
 #[cfg(not(feature = "threads"))]
 impl Threads {
     /// The calling thread. `count` must be 0 or 1.
@@ -188,37 +187,9 @@ impl Threads {
         Ok(Threads {})
     }
 
-    /// Like [`new`](Self::new).
-    ///
-    /// # Errors
-    ///
-    /// Those of [`new`](Self::new).
-    pub fn timed(count: usize) -> Result<Self, PoolError> {
-        Self::new(count)
-    }
-
-    /// Binds no thread, since there are no workers.
-    ///
-    /// # Errors
-    ///
-    /// None.
-    pub fn pin(&self, _first: usize) -> Result<(), PoolError> {
-        Ok(())
-    }
-
     /// Number of threads that step environments at the same time: 1.
     pub fn count(&self) -> usize {
         1
-    }
-
-    /// Not measured.
-    pub fn take_times(&self) -> Option<StepTimes> {
-        None
-    }
-
-    /// Calls `work(0)`.
-    pub fn on_each(&self, _count: usize, work: &(dyn Fn(usize) + Sync)) {
-        work(0);
     }
 
     /// Calls `work(0..items)`.
