@@ -142,7 +142,9 @@ impl Pool {
         self.check_batch(batch)?;
         if let Some(options) = options {
             // Comes after all other checks, so that an error changes no environment.
-            catch(|| self.envs.set_options_of(request, options)).map_err(|message| self.panic(None, message))??;
+            let envs = (0..num_envs).filter(|env| request.resets(*env)).collect();
+            let sets = [NextOptions { options: options.clone(), envs }];
+            catch(|| self.envs.set_options(&sets)).map_err(|message| self.panic(None, message))??;
         }
         self.write(batch, |envs, context, out| envs.reset(context, request, out))?;
         self.was_reset = true;

@@ -55,9 +55,6 @@ pub(super) trait AnyEnvs: Send + Sync {
     /// Sets reset parameters for environments, from their next episode on. The environments' numbers must be in range.
     fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), ParameterError>;
 
-    /// Like [`set_options`](Self::set_options), for the environments that `request` resets.
-    fn set_options_of(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError>;
-
     /// Seed and reset parameters of an environment's running episode.
     fn running_episode(&self, env: usize) -> RunningEpisode;
 
@@ -238,16 +235,6 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
         for (set, (assets, options)) in sets.iter().zip(made) {
             for env in &set.envs {
                 self.slots[*env].next = Some((Arc::clone(&assets), Arc::clone(&options)));
-            }
-        }
-        Ok(())
-    }
-
-    fn set_options_of(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError> {
-        let (assets, options) = self.with_options(options)?;
-        for (env, slot) in self.slots.iter_mut().enumerate() {
-            if request.resets(env) {
-                slot.next = Some((Arc::clone(&assets), Arc::clone(&options)));
             }
         }
         Ok(())
