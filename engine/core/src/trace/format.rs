@@ -6,8 +6,7 @@ use std::path::Path;
 use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
-use serde::ser::SerializeTuple;
-use serde::{Deserialize, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
@@ -50,8 +49,8 @@ pub struct Episode {
 }
 
 /// One recorded step.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(from = "StepFields")]
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(from = "StepFields", into = "StepFields")]
 pub struct Step {
     /// One number for each branch of the action space.
     pub action: Vec<i32>,
@@ -67,30 +66,27 @@ pub struct Step {
     pub render_crc: Option<u32>,
 }
 
-#[derive(Deserialize)]
+/// A single-number action is a number, others are lists.
+#[derive(Deserialize, Serialize)]
 #[serde(untagged)]
 enum Action {
     One(i32),
     Several(Vec<i32>),
 }
 
-type StepWithoutRender = (Action, f64, bool, u32, Map<String, Json>);
-
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum StepFields {
-    Plain(StepWithoutRender),
-    Rendered(Action, f64, bool, u32, Map<String, Json>, u32),
-}
+/// A step as in the file: a list.
+#[derive(Deserialize, Serialize)]
+struct StepFields(
+    Action,
+    f64,
+    bool,
+    u32,
+    Map<String, Json>,
+    #[serde(default, skip_serializing_if = "Option::is_none")] Option<u32>,
+);
 
 impl From<StepFields> for Step {
-    fn from(fields: StepFields) -> Self {
-        let ((action, reward, done, crc, info), render_crc) = match fields {
-            StepFields::Plain(fields) => (fields, None),
-            StepFields::Rendered(action, reward, done, crc, info, render) => {
-                ((action, reward, done, crc, info), Some(render))
-            }
-        };
+    fn from(StepFields(action, reward, done, crc, info, render_crc): StepFields) -> Self {
         let action = match action {
             Action::One(action) => vec![action],
             Action::Several(action) => action,
@@ -99,22 +95,13 @@ impl From<StepFields> for Step {
     }
 }
 
-/// As in the file: a list, with a single-number action as a number.
-impl Serialize for Step {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut list = serializer.serialize_tuple(if self.render_crc.is_some() { 6 } else { 5 })?;
-        match self.action.as_slice() {
-            [action] => list.serialize_element(action)?,
-            actions => list.serialize_element(actions)?,
-        }
-        list.serialize_element(&self.reward)?;
-        list.serialize_element(&self.done)?;
-        list.serialize_element(&self.crc)?;
-        list.serialize_element(&self.info)?;
-        if let Some(crc) = &self.render_crc {
-            list.serialize_element(crc)?;
-        }
-        list.end()
+impl From<Step> for StepFields {
+    fn from(Step { action, reward, done, crc, info, render_crc }: Step) -> Self {
+        let action = match *action {
+            [action] => Action::One(action),
+            _ => Action::Several(action),
+        };
+        StepFields(action, reward, done, crc, info, render_crc)
     }
 }
 
