@@ -77,44 +77,6 @@ impl fmt::Display for RowShape {
     }
 }
 
-/// numpy's name for a Rust number type, for the documentation.
-macro_rules! dtype_name {
-    (u8) => {
-        "uint8"
-    };
-    (i32) => {
-        "int32"
-    };
-    (u64) => {
-        "uint64"
-    };
-    (f32) => {
-        "float32"
-    };
-    (f64) => {
-        "float64"
-    };
-}
-
-/// A row's shape, for the documentation.
-macro_rules! row_name {
-    (Scalar) => {
-        "()"
-    };
-    (Flag) => {
-        "()"
-    };
-    (Vector) => {
-        "(k,)"
-    };
-    (Frames) => {
-        "(84, 84, 3), or as [`Frames`] describes"
-    };
-    (Bytes) => {
-        "(k,)"
-    };
-}
-
 macro_rules! presence {
     (required) => {
         true
@@ -133,13 +95,19 @@ macro_rules! section_table {
     ) => {
         $(#[$meta])*
         ///
-        /// | section | dtype | row shape | contents |
+        /// | section | number type | row | contents |
         /// | --- | --- | --- | --- |
-        $(#[doc = concat!("| `", stringify!($name), "` | ", dtype_name!($element), " | ", row_name!($row), " | ", $meaning, " |")])*
+        $(#[doc = concat!(
+            "| `", stringify!($name), "` | `", stringify!($element), "` | [`", stringify!($row), "`](RowShape::", stringify!($row), ") | ",
+            $meaning, " |"
+        )])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
         pub enum $table {
             $(
-                #[doc = concat!("`", stringify!($name), "`, ", dtype_name!($element), " ", row_name!($row), ": ", $meaning, ".")]
+                #[doc = concat!(
+                    "`", stringify!($name), "`, `", stringify!($element), "` [`", stringify!($row), "`](RowShape::", stringify!($row), "): ",
+                    $meaning, "."
+                )]
                 $variant,
             )*
         }
