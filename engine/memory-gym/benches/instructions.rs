@@ -20,10 +20,8 @@ fn main() {
     let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
     let mut batch = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut batch).unwrap();
-    let branches = spec.action_space.branches();
     let mut random = Generator::from_seed(1);
-    let mut draw = |choices: &i32| i32::try_from(random.integers(0, i64::from(*choices))).unwrap();
-    let mut actions = || (0..NUM_ENVS).flat_map(|_| branches).map(&mut draw).collect();
+    let mut actions = || (0..NUM_ENVS).flat_map(|_| spec.action_space.sample(&mut random)).collect();
     let actions: Vec<Vec<i32>> = (0..WARM_UP + STEPS).map(|_| actions()).collect();
     let (warm_up, counted) = actions.split_at(WARM_UP);
     steps(&mut pool, warm_up, &mut batch);

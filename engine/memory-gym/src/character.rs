@@ -12,24 +12,16 @@ pub(super) const MARGIN: i32 = 14;
 /// Dimensions of the character at one scale, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CharacterSize {
-    radius: i32,
-    hand_radius: i32,
+    /// Radius of the body.
+    pub radius: i32,
+    /// Radius of a hand.
+    pub hand_radius: i32,
 }
 
 impl CharacterSize {
     /// The dimensions at `scale`, at least 0; 0.25 is the original's default. Lengths are truncated to whole pixels.
     pub fn new(scale: f64) -> Self {
         CharacterSize { radius: (25.0 * scale) as i32, hand_radius: (10.0 * scale) as i32 }
-    }
-
-    /// Radius of the body.
-    pub fn radius(&self) -> i32 {
-        self.radius
-    }
-
-    /// Radius of a hand.
-    pub fn hand_radius(&self) -> i32 {
-        self.hand_radius
     }
 
     /// Side of the square picture, with body, hands and margin.

@@ -34,14 +34,14 @@ impl CharacterSprites {
             let mut surface = Surface::new(side as usize, side as usize);
             surface.fill(TRANSPARENT);
             surface.set_color_key(Some(TRANSPARENT));
-            surface.draw_circle(BODY, (centre, centre), size.radius(), 0);
+            surface.draw_circle(BODY, (centre, centre), size.radius, 0);
             let degrees = 360.0 - 45.0 * eighth as f64;
             let hands = hands.map(|hand| {
                 let [x, y] = rotate(hand, degrees);
                 ((x + f64::from(centre)) as i32, (y + f64::from(centre)) as i32)
             });
-            hands.iter().for_each(|hand| surface.draw_circle(HANDS, *hand, size.hand_radius(), 0));
-            hands.iter().for_each(|hand| surface.draw_circle(HAND_OUTLINES, *hand, size.hand_radius(), pixels(3.0)));
+            hands.iter().for_each(|hand| surface.draw_circle(HANDS, *hand, size.hand_radius, 0));
+            hands.iter().for_each(|hand| surface.draw_circle(HAND_OUTLINES, *hand, size.hand_radius, pixels(3.0)));
             Sprite::new(&surface)
         });
         CharacterSprites { size, sprites }

@@ -134,7 +134,7 @@ impl State {
     }
 
     fn move_agent(&mut self, config: &Config, action: &[i32]) {
-        let (speed, radius) = (config.parameters.agent_speed, config.agent.radius());
+        let (speed, radius) = (config.parameters.agent_speed, config.agent.radius);
         match config.variant.locomotion {
             Locomotion::Free => self.agent.step_within(action, speed, radius, config.arena),
             Locomotion::Wrapping => self.agent.step_wrapping(action, speed, radius, config.arena),

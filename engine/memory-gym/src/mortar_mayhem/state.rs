@@ -69,7 +69,7 @@ impl State {
             DisplayedCharacter::Initial | DisplayedCharacter::Current => true,
         };
         let Config { parameters, variant, arena: (left, _, right, _), .. } = config;
-        let (radius, (x, y)) = (config.agent.radius(), self.agent.position);
+        let (radius, (x, y)) = (config.agent.radius, self.agent.position);
         self.agent.is_valid()
             && [x, y].iter().all(|at| (left - radius..=right + radius).contains(at))
             && self.agent_tile == config.tile_at(self.agent.position)

@@ -37,7 +37,7 @@ impl Config {
             Variant::Endless => -f64::from(TILE) * parameters.camera_offset_scale.clamp(0.0, MAX_CAMERA_OFFSET),
         };
         // The picture's left edge, truncated when it is drawn.
-        let left = f64::from(agent.radius() - agent.centre()) - camera;
+        let left = f64::from(agent.radius - agent.centre()) - camera;
         Config {
             variant,
             agent,

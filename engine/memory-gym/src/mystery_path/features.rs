@@ -100,7 +100,7 @@ impl State {
         }
         if parameters.show_past_path {
             let camera = self.endless.camera / f64::from(TILE);
-            for (_, (x, row)) in self.past_tiles(config) {
+            for (x, row) in self.past_tiles(config) {
                 let column = (x - camera.floor() as i32).clamp(0, GRID);
                 out[PAST_SHIFT] = (camera - camera.floor()) as f32;
                 out[PAST_PATH + (column * GRID + row) as usize] = 1.0;

@@ -37,7 +37,7 @@ impl State {
         let inset = match config.variant {
             Variant::Grid => TILE / 2,
             // The middle of the tile only at the default scale.
-            Variant::Free | Variant::Endless => config.agent.radius(),
+            Variant::Free | Variant::Endless => config.agent.radius,
         };
         let (x, y) = self.route.start();
         (x * TILE + inset, y * TILE + inset)
@@ -72,7 +72,7 @@ impl State {
     /// Moves the agent, or returns it to the start after a fall.
     fn move_agent(&mut self, config: &Config, action: &[i32]) {
         const BOUNDS: Bounds = (0, 0, SCREEN as i32, SCREEN as i32);
-        let (speed, radius) = (config.parameters.agent_speed, config.agent.radius());
+        let (speed, radius) = (config.parameters.agent_speed, config.agent.radius);
         if self.off_path {
             self.agent.position = self.origin(config);
         }

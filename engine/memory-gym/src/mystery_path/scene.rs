@@ -57,19 +57,19 @@ impl State {
 
     fn past(&self, config: &Config) -> PastPath {
         // At most eight columns are on the screen.
-        let Some(first) = self.past_tiles(config).map(|(_, (x, _))| x).min() else { return PastPath::default() };
+        let Some(first) = self.past_tiles(config).map(|(x, _)| x).min() else { return PastPath::default() };
         let mut past = PastPath { camera: self.endless.camera, first, tiles: TileSet::default() };
-        self.past_tiles(config).for_each(|(_, (x, y))| past.tiles.insert((x - first, y)));
+        self.past_tiles(config).for_each(|(x, y)| past.tiles.insert((x - first, y)));
         past
     }
 
-    /// The past path's tiles on the screen, each with its left edge in pixels, truncated as it is drawn.
-    pub(super) fn past_tiles(&self, config: &Config) -> impl Iterator<Item = (i32, Tile)> {
+    /// The past path's tiles on the screen, whose left edges are truncated to pixels as they are drawn.
+    pub(super) fn past_tiles(&self, config: &Config) -> impl Iterator<Item = Tile> {
         let camera = self.endless.camera;
+        let left = move |(x, _): &Tile| (f64::from(x * TILE) - camera) as i32;
         self.endless
             .past_path(self.tile, config.past_depth, &self.route)
-            .map(move |(x, y)| ((f64::from(x * TILE) - camera) as i32, (x, y)))
-            .filter(|(left, _)| (1 - TILE..SCREEN as i32).contains(left))
+            .filter(move |tile| (1 - TILE..SCREEN as i32).contains(&left(tile)))
     }
 
     /// The agent at its position on the screen.

@@ -49,9 +49,7 @@ impl State {
                 Variant::Free => x.min(y) >= 0 && x <= end(start_x) && y <= end(start_y),
                 Variant::Grid => (x, y) == centre(self.tile) && TileSet::GRID.contains(self.tile),
                 // One step off the path, at the most.
-                Variant::Endless => {
-                    x >= 0 && (-(SCREEN as i32)..=2 * SCREEN as i32 + config.agent.radius()).contains(&y)
-                }
+                Variant::Endless => x >= 0 && (-(SCREEN as i32)..=2 * SCREEN as i32 + config.agent.radius).contains(&y),
             }
             && self.endless.is_valid(&self.route, config, x - start_x)
             && (self.steps == 0 || self.success || self.off_path != self.route.contains(self.tile))

@@ -88,7 +88,7 @@ impl State {
     pub(super) fn step(&mut self, config: &Config, action: &[i32], random: &mut Generator) -> Transition {
         let parameters = &config.parameters;
         self.first_frame = false;
-        self.agent.step_within(action, parameters.agent_speed, config.agent.radius(), WALKABLE);
+        self.agent.step_within(action, parameters.agent_speed, config.agent.radius, WALKABLE);
         self.shown_action = self.last_action;
         self.last_action = [action[0], action[1]];
         self.dim_light(parameters);
@@ -105,7 +105,7 @@ impl State {
         let mut left = false;
         if let Some(exit) = self.exit.as_mut().filter(|_| coins_done) {
             exit.open = true;
-            left = reaches(exit.location, self.agent, config.exit_radius + f64::from(config.agent.radius()));
+            left = reaches(exit.location, self.agent, config.exit_radius + f64::from(config.agent.radius));
             reward += if left { parameters.reward_exit } else { 0.0 };
         }
         let all_collected = coins_done && self.num_coins > 0 && !parameters.use_exit && !config.variant.endless;
@@ -154,7 +154,7 @@ impl State {
             } else {
                 spotlight.advance();
                 self.lit.push(spotlight.circle());
-                let reach = spotlight.radius + config.agent.radius();
+                let reach = spotlight.radius + config.agent.radius;
                 self.hit |= distance(spotlight.location, agent) <= f64::from(reach);
             }
             index += 1;
@@ -181,7 +181,7 @@ impl State {
 
     /// Collects the coins that the agent reaches. Returns the reward.
     fn collect_coins(&mut self, config: &Config) -> f64 {
-        let reach = f64::from(config.coin_radius + config.agent.radius());
+        let reach = f64::from(config.coin_radius + config.agent.radius);
         let mut reward = 0.0;
         let mut index = 0;
         while let Some(&coin) = self.coins.get(index) {
@@ -198,7 +198,7 @@ impl State {
 
     /// Replaces the only coin with a new one if the agent reaches it. Returns the reward.
     fn collect_endless_coin(&mut self, config: &Config, random: &mut Generator) -> f64 {
-        let reach = f64::from(config.coin_radius + config.agent.radius());
+        let reach = f64::from(config.coin_radius + config.agent.radius);
         match self.coins.first_mut() {
             Some(coin) if reaches(*coin, self.agent, reach) => {
                 *coin = next_coin(Some(*coin), random);

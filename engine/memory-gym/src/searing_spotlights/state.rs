@@ -101,10 +101,8 @@ impl State {
         };
         let margins = SPAWN_MARGIN..=SCREEN as i32 - SPAWN_MARGIN;
         let collected = if config.variant.endless { 0 } else { self.coins_collected as usize };
-        is_within(&self.agent, end(config.agent.radius()))
-            && self
-                .former_agent
-                .is_none_or(|agent| is_within(&agent, end(CharacterSize::new(MAX_AGENT_SCALE).radius())))
+        is_within(&self.agent, end(config.agent.radius))
+            && self.former_agent.is_none_or(|agent| is_within(&agent, end(CharacterSize::new(MAX_AGENT_SCALE).radius)))
             && self.health.is_finite()
             && self.health <= parameters.agent_health
             && usize::from(self.red_columns) <= SCREEN
