@@ -28,8 +28,7 @@ pub const SUITS: &[ActionBranch] = &[ActionBranch {
 }];
 
 /// The types of the families whose rewards of 0 are integers.
-pub const INTEGER_ZERO: OriginalTypes =
-    OriginalTypes { integers: "int64", reward: RewardType::IntegerZero, numpy_floats: &[] };
+pub const INTEGER_ZERO: OriginalTypes = OriginalTypes { reward: RewardType::IntegerZero, ..OriginalTypes::DEFAULT };
 
 /// The shape of a part of the state, which is never freed.
 pub fn shape(sizes: &[usize]) -> &'static [usize] {

@@ -130,7 +130,7 @@ impl Task for Labyrinth {
         let summary = "Find the exit of a maze, seeing only the squares around";
         EnvSpec {
             needs_previous_action: true,
-            types: OriginalTypes { integers: "int32", ..OriginalTypes::default() },
+            types: OriginalTypes { integers: "int32", ..OriginalTypes::DEFAULT },
             actions: ACTIONS,
             features: [numbered("square", VIEW, squares), &[action]].concat().leak(),
             observation_space: Some(SPACE),

@@ -91,7 +91,7 @@ impl Task for Pendulum {
             shape: &[3],
             dtype: "float32",
         }];
-        let types = OriginalTypes { reward: RewardType::NumpyFloat, ..OriginalTypes::default() };
+        let types = OriginalTypes { reward: RewardType::NumpyFloat, ..OriginalTypes::DEFAULT };
         let summary = "Swing a pendulum up, seeing only its angle";
         EnvSpec {
             markov_state: STATE,

@@ -36,11 +36,4 @@ pub use view::Batch;
 pub(crate) use view::BatchMut;
 
 /// Version of the sections' meaning and of the messages that carry batches. A trainer rejects an engine of another version.
-///
-/// Version 4: the specification's key `epoch` became `incarnation`, the message headers have new type names, and a reset with a
-/// seed counts the environments of all groups.
-///
-/// Version 6: requests that set the options of the next episodes, and that return the seeds and options of running ones.
-///
-/// Version 8: batches no longer say which rows of frames have changed, unlike those of version 7.
 pub const LAYOUT_VERSION: u32 = 8;

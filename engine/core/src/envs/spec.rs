@@ -238,8 +238,8 @@ pub enum StateSpace {
     },
 }
 
-/// The types of a Python class that an environment reproduces, where they are not those of its spaces. The default is right for all
-/// other environments.
+/// The types of a Python class that an environment reproduces, where they are not those of its spaces. [`DEFAULT`](Self::DEFAULT)
+/// is right for all other environments.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct OriginalTypes {
     /// numpy's dtype of arrays of integers in observations.
@@ -250,14 +250,10 @@ pub struct OriginalTypes {
     pub numpy_floats: &'static [&'static str],
 }
 
-impl Default for OriginalTypes {
-    fn default() -> Self {
-        OriginalTypes::DEFAULT
-    }
-}
-
 impl OriginalTypes {
-    const DEFAULT: OriginalTypes = OriginalTypes { integers: "int64", reward: RewardType::Float, numpy_floats: &[] };
+    /// The types of most environments: integers of 64 bits, and floats.
+    pub const DEFAULT: OriginalTypes =
+        OriginalTypes { integers: "int64", reward: RewardType::Float, numpy_floats: &[] };
 }
 
 /// The type of a Python class's rewards.

@@ -116,13 +116,9 @@ impl Disc {
     /// The part of `rows` in the column `x` that the disc about `center` covers.
     #[inline]
     pub fn rows(&self, center: (i32, i32), x: usize, rows: &Range<usize>) -> Range<usize> {
-        let right = x as i64 - i64::from(center.0);
-        let index = if right < 0 { -right - 1 } else { right };
+        let half = i64::from(self.half_height(x as i64 - i64::from(center.0)));
         let center_y = i64::from(center.1);
-        match self.half_heights.get(index as usize) {
-            Some(&half) => clip(center_y - i64::from(half), center_y + i64::from(half) - 1, rows),
-            None => 0..0,
-        }
+        clip(center_y - half, center_y + half - 1, rows)
     }
 }
 

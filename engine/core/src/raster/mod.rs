@@ -38,13 +38,11 @@ mod tests;
 
 pub use blit::blend_keyed;
 pub use canvas::Canvas;
-pub use circle::circle_outline;
-pub use circle::{Disc, DiscColumn};
+pub use circle::{Disc, DiscColumn, circle_outline};
 pub use damage::Damage;
 pub use dirty_surface::DirtySurface;
 pub use format::{FrameShape, PixelFormat};
 pub use rect::{CornerRadii, Rect};
-pub use runs::Rgb;
-pub use runs::copy_run;
+pub use runs::{Rgb, copy_run};
 pub use sprite::Sprite;
 pub use surface::Surface;
