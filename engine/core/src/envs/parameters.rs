@@ -161,51 +161,40 @@ impl Parameter {
         };
         let wrong =
             |_| ParameterError::Argument { name: self.name, value: text.to_owned(), allowed: self.requirement() };
-        let kind = match (self.kind, self.parse(&json.unwrap_or_else(|_| text.into())).map_err(wrong)?) {
-            (ParameterKind::Int { min, max, .. }, Value::Int(default)) => ParameterKind::Int { default, min, max },
-            (ParameterKind::Float { min, max, .. }, Value::Float(default)) => {
-                ParameterKind::Float { default, min, max }
-            }
-            (ParameterKind::IntList { min, max, .. }, Value::IntList(items)) => {
-                ParameterKind::IntList { default: items.leak(), min, max }
-            }
-            (ParameterKind::Choice { choices, .. }, Value::Choice(default)) => {
-                ParameterKind::Choice { default, choices }
-            }
-            (_, Value::Bool(default)) => ParameterKind::Bool { default },
-            (kind, _) => kind,
-        };
+        let value = self.parse(&json.unwrap_or_else(|_| text.into())).map_err(wrong)?;
+        let mut kind = self.kind;
+        match (&mut kind, value) {
+            (ParameterKind::Bool { default }, Value::Bool(new)) => *default = new,
+            (ParameterKind::Int { default, .. }, Value::Int(new)) => *default = new,
+            (ParameterKind::Float { default, .. }, Value::Float(new)) => *default = new,
+            (ParameterKind::IntList { default, .. }, Value::IntList(new)) => *default = new.leak(),
+            (ParameterKind::Choice { default, .. }, Value::Choice(new)) => *default = new,
+            _ => {}
+        }
         Ok(Parameter { kind, ..self })
     }
 
     fn parse(&self, given: &Json) -> Result<Value, ParameterError> {
-        let wrong_type =
-            || ParameterError::WrongType { name: self.name, value: given.to_string(), allowed: self.requirement() };
-        let out_of_range =
-            || ParameterError::OutOfRange { name: self.name, value: given.to_string(), allowed: self.requirement() };
+        let wrong = || ParameterError::Value { name: self.name, value: given.to_string(), allowed: self.requirement() };
         match self.kind {
-            ParameterKind::Bool { .. } => given.as_bool().map(Value::Bool).ok_or_else(wrong_type),
+            ParameterKind::Bool { .. } => given.as_bool().map(Value::Bool).ok_or_else(wrong),
             ParameterKind::Int { min, max, .. } => {
-                let value = integer(given).ok_or_else(wrong_type)?;
-                (min..=max).contains(&value).then_some(Value::Int(value)).ok_or_else(out_of_range)
+                let value = integer(given).ok_or_else(wrong)?;
+                (min..=max).contains(&value).then_some(Value::Int(value)).ok_or_else(wrong)
             }
             ParameterKind::Float { min, max, .. } => {
-                let value = given.as_f64().ok_or_else(wrong_type)?;
-                (min..=max).contains(&value).then_some(Value::Float(value)).ok_or_else(out_of_range)
+                let value = given.as_f64().ok_or_else(wrong)?;
+                (min..=max).contains(&value).then_some(Value::Float(value)).ok_or_else(wrong)
             }
             ParameterKind::IntList { min, max, .. } => {
-                let items = given.as_array().ok_or_else(wrong_type)?;
-                let values: Vec<i64> = items.iter().map(integer).collect::<Option<_>>().ok_or_else(wrong_type)?;
+                let items = given.as_array().ok_or_else(wrong)?;
+                let values: Vec<i64> = items.iter().map(integer).collect::<Option<_>>().ok_or_else(wrong)?;
                 let fits = (1..=MAX_LIST).contains(&values.len()) && values.iter().all(|v| (min..=max).contains(v));
-                fits.then_some(Value::IntList(values)).ok_or_else(out_of_range)
+                fits.then_some(Value::IntList(values)).ok_or_else(wrong)
             }
             ParameterKind::Choice { choices, .. } => {
-                let given = given.as_str().ok_or_else(wrong_type)?;
-                choices
-                    .iter()
-                    .find(|choice| **choice == given)
-                    .map(|choice| Value::Choice(choice))
-                    .ok_or_else(out_of_range)
+                let given = given.as_str().ok_or_else(wrong)?;
+                choices.iter().find(|choice| **choice == given).map(|choice| Value::Choice(choice)).ok_or_else(wrong)
             }
         }
     }
@@ -300,9 +289,9 @@ pub enum ParameterError {
         /// The environment's reset parameters, separated by commas.
         allowed: String,
     },
-    /// The value has the wrong type.
+    /// The value has the wrong type or is out of range.
     #[error("reset parameter `{name}` must be {allowed}, got {value}")]
-    WrongType {
+    Value {
         name: &'static str,
         value: String,
         /// Allowed type and range as text.
@@ -324,14 +313,6 @@ pub enum ParameterError {
         /// The argument's name.
         name: &'static str,
         /// The given value.
-        value: String,
-        /// Allowed type and range as text.
-        allowed: String,
-    },
-    /// The value has the right type but is out of range.
-    #[error("reset parameter `{name}` must be {allowed}, got {value}")]
-    OutOfRange {
-        name: &'static str,
         value: String,
         /// Allowed type and range as text.
         allowed: String,
