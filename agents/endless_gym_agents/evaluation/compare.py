@@ -38,7 +38,7 @@ from endless_gym_agents.settings import Environment, Settings
 #: What a row may say about its cost: name in the files, heading, and how those of an agent's runs are put together.
 COSTS: dict[str, tuple[str, Callable[[Sequence[float]], float]]] = {
     "parameters": ("parameters", statistics.median),
-    "core_seconds": ("core-seconds of a run", statistics.median),
+    "core_seconds": ("core-seconds of a run", min),
     "tuning_core_seconds": ("core-seconds of tuning", max),
     "state_bytes": ("bytes of state", max),
     "acting": ("acting, steps/s", max),

@@ -45,8 +45,8 @@ def page(track: Track, rows: Sequence[Mapping[str, Any]], comparison: Comparison
         lines += ["Each row is one untuned configuration: the table does not say which memory is best.", ""]
     lines += [
         "The expert sees the whole state, so the optimality gap is that to the fully observable task. Acting and learning are",
-        "environment steps per second in that phase of training, in the run that other work disturbed least, and the",
-        "core-seconds of a run are the median; they depend on the machine.",
+        "environment steps per second in that phase of training; they and the core-seconds are those of the run that other",
+        "work on the machine disturbed least.",
         "",
         "![comparison](comparison.svg)",
         "",
