@@ -15,6 +15,7 @@ import dataclasses
 import json
 import shlex
 import subprocess
+import sys
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -23,6 +24,7 @@ import torch
 
 from endless_gym.program import program
 from endless_gym_agents.common import atomic
+from endless_gym_agents.common.command import on_stop_signals
 from endless_gym_agents.evaluation.curves import published
 from endless_gym_agents.evaluation.evaluate import evaluate, mean
 from endless_gym_agents.evaluation.results import metric
@@ -151,8 +153,10 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     if args.task:
         args.out.mkdir(parents=True, exist_ok=True)
-        for seed in args.seeds:
-            add(args.task, args.agent, run(args.task, args.agent, seed, args.scale, args.out))
+        # An exception ends the program that learns; the default action of SIGTERM would leave it running.
+        with on_stop_signals(lambda number, _: sys.exit(128 + number)):
+            for seed in args.seeds:
+                add(args.task, args.agent, run(args.task, args.agent, seed, args.scale, args.out))
     if args.report:
         report()
 

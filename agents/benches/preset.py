@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 from endless_gym.program import program
+from endless_gym_agents.common.command import on_stop_signals
 from endless_gym_agents.training.logs import read_progress
 
 SEEDS = (1, 2, 3)
@@ -62,4 +63,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    # An exception ends the program that learns; the default action of SIGTERM would leave it running.
+    with on_stop_signals(lambda number, _: sys.exit(128 + number)):
+        main(Path(sys.argv[1]))
