@@ -513,7 +513,6 @@ def from_dict(values: dict[str, Any]) -> Settings:
         TypeError: An unknown field.
     """
     values = dict(values)
-    values.pop("compile", None)  # a setting of earlier versions
     for part in dataclasses.fields(Settings):
         if dataclasses.is_dataclass(kind := part.default_factory):
             # A run of `endless learn` has only the settings that it uses.

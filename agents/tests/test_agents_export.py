@@ -4,7 +4,6 @@ import json
 import os
 import stat
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -123,25 +122,16 @@ def test_a_file_with_any_part_changed_is_refused(file: Path, tmp_path: Path) -> 
             pytest.fail(f"{what} is read")
 
 
-def test_older_files_are_read_unless_their_weights_have_another_type(tmp_path: Path) -> None:
-    """Files of version 1 have no checksum, as exported agents, or one without types and shapes, as those of `endless learn`."""
-    content, older = FILES[0].read_bytes(), tmp_path / "older.safetensors"
-    with safe_open(FILES[0], "pt") as opened:
-        text = json.dumps(header(FILES[0]) | {"version": 1})
-        total = zlib.crc32(text.encode())
-        for name in sorted(opened.keys()):
-            total = zlib.crc32(opened.get_tensor(name).numpy().tobytes(), zlib.crc32(name.encode(), total))
-    for metadata in ({"endless": text}, {"endless": text, "crc32": f"{total:08x}"}):
-        given = described(content, lambda all, given=metadata: all.update(__metadata__=given))
-        older.write_bytes(given)
-        assert checkpoint.load(older).update == checkpoint.load(FILES[0]).update
-        for dtype in ("I32", "U32"):
-            older.write_bytes(given.replace(b'"dtype":"F32"', f'"dtype":"{dtype}"'.encode(), 1))
-            with pytest.raises(ValueError, match=r"weights must be float32, got torch\.u?int32 in"):
-                checkpoint.load(older)
-    older.write_bytes(given[:-1] + bytes([given[-1] ^ 1]))
-    with pytest.raises(ValueError, match="its checksum differs"):
-        checkpoint.load(older)
+def test_another_version_and_weights_of_another_type_are_refused(tmp_path: Path) -> None:
+    weights, file = load_file(FILES[0]), tmp_path / "other.safetensors"
+    file.write_bytes(checkpoint.to_safetensors(weights, header(FILES[0]) | {"version": 1}))
+    with pytest.raises(ValueError, match="must be of version 2, got 1; use the version of endless-gym that wrote it"):
+        checkpoint.load(file)
+    name = "encoder.vector.0.weight"
+    for dtype in (torch.int32, torch.uint32):
+        file.write_bytes(checkpoint.to_safetensors(weights | {name: weights[name].view(dtype)}, header(FILES[0])))
+        with pytest.raises(ValueError, match=rf"weights must be float32, got {dtype} in {name}"):
+            checkpoint.load(file)
 
 
 def test_agents_that_the_page_cannot_compute_are_refused(tmp_path: Path) -> None:

@@ -94,13 +94,6 @@ def test_settings_round_trip_through_dicts(name: str) -> None:
     assert from_dict(to_dict(given.validated())) == given.validated()
 
 
-def test_settings_of_earlier_versions_get_defaults_for_new_fields() -> None:
-    values = to_dict(PAPER)
-    del values["transformer"]["query_previous"]
-    assert from_dict(values) == PAPER
-    assert not any("fusion" in name for name in make("trxl").state_dict())
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

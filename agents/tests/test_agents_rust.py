@@ -219,10 +219,9 @@ def test_a_damaged_or_forged_checkpoint_is_refused(tmp_path: Path) -> None:
             checkpoint.load(file)
     content.tofile(file)
     weights, whole = load_file(file), checkpoint.load(file).state
-    # Version 1 needs no checksum.
-    header = {name: whole[name] for name in ("settings", "update", "steps")} | {"version": 1}
+    header = {name: whole[name] for name in ("version", "settings", "update", "steps")}
     for text in ("[" * 100_000, '{"a":' * 100_000, "[]", "3", "{}", json.dumps(header | {"settings": 3})):
-        save_file(weights, file, {"endless": text})
+        save_file(weights, file, {"endless": text, "crc32": checkpoint._checksum(text, weights)})
         with pytest.raises(ValueError, match=r"is damaged|are invalid"):
             checkpoint.load(file)
     # A header of the format that claims more than the file has.

@@ -35,8 +35,8 @@ from endless_gym_agents.training.logs import PROGRESS
 #: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
 CHECKPOINT_VERSION = 1
 
-#: Versions of the files of `endless learn` and of exported agents that can be read; the last one is written.
-FILE_VERSIONS = (1, 2)
+#: Version of the files of `endless learn` and of exported agents.
+FILE_VERSION = 2
 
 #: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it. Checkpoints of
 #: `endless learn`, the trainer in Rust, end with `RUST_SUFFIX` instead.
@@ -215,16 +215,14 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         raise FileNotFoundError(
             f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
         )
-    versions: tuple[int, ...] = (CHECKPOINT_VERSION,)
     if file.suffix == RUST_SUFFIX:
-        state, versions, size = _read_of_rust(file), FILE_VERSIONS, file.stat().st_size
+        state, expected, size = _read_of_rust(file), FILE_VERSION, file.stat().st_size
     else:
         with _opened(file) as content:
-            state, size = _read(content, file), content.seek(0, io.SEEK_END)
-    if (version := state.get("version")) not in versions:
+            state, expected, size = _read(content, file), CHECKPOINT_VERSION, content.seek(0, io.SEEK_END)
+    if (version := state.get("version")) != expected:
         raise ValueError(
-            f"checkpoint {file} must be of version {' or '.join(map(str, versions))}, got {version}; "
-            "use the version of endless-gym that wrote it"
+            f"checkpoint {file} must be of version {expected}, got {version}; use the version of endless-gym that wrote it"
         )
     if missing := [name for name in ("settings", "update", "steps", "model") if name not in state]:
         raise ValueError(f"checkpoint {file} is incomplete: it has no {', '.join(missing)}")
@@ -317,9 +315,7 @@ def _read_of_rust(file: Path) -> dict[str, Any]:
     try:
         header = json.loads(metadata["endless"])
         state = {name: header[name] for name in ("version", "settings", "update", "steps")}
-        version, has_checksum = state["version"], "crc32" in metadata or state["version"] != 1
-        expected = _checksum(version, metadata["endless"], tensors) if version in FILE_VERSIONS else ""
-        if expected and has_checksum and metadata.get("crc32") != expected:
+        if state["version"] == FILE_VERSION and metadata.get("crc32") != _checksum(metadata["endless"], tensors):
             raise ValueError("its checksum differs")
         model = {name: tensor for name, tensor in tensors.items() if not name.startswith("state/")}
         if other := [f"{tensor.dtype} in {name}" for name, tensor in model.items() if tensor.dtype != torch.float32]:
@@ -336,18 +332,17 @@ def to_safetensors(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any
         tensors: Weights by name, float32, on the CPU and contiguous.
         header: The header without its version, which is added; `None` for a file of weights alone.
     """
-    version = FILE_VERSIONS[-1]
-    text = "" if header is None else json.dumps({"version": version, **header}, separators=(",", ":"))
-    metadata = {"crc32": _checksum(version, text, tensors)} | ({"endless": text} if text else {})
+    text = "" if header is None else json.dumps({"version": FILE_VERSION, **header}, separators=(",", ":"))
+    metadata = {"crc32": _checksum(text, tensors)} | ({"endless": text} if text else {})
     return save_tensors(dict(tensors), metadata)
 
 
-def _checksum(version: int, header: str, tensors: Mapping[str, torch.Tensor]) -> str:
+def _checksum(header: str, tensors: Mapping[str, torch.Tensor]) -> str:
     """As in the crate `endless-gym-kernels`, which defines it."""
     names = {torch.float32: "F32", torch.int32: "I32", torch.uint8: "U8", torch.uint64: "U64"}
     total = zlib.crc32(header.encode())
     for name, tensor in sorted(tensors.items()):
-        described = f"{name} {names.get(tensor.dtype)} {list(tensor.shape)}" if version > 1 else name
+        described = f"{name} {names.get(tensor.dtype)} {list(tensor.shape)}"
         total = zlib.crc32(tensor.numpy().tobytes(), zlib.crc32(described.encode(), total))
     return f"{total:08x}"
 

@@ -8,7 +8,7 @@ use safetensors::tensor::{SafeTensorError, SafeTensors, TensorView};
 use serde::Deserialize;
 use thiserror::Error;
 
-/// Version of the files that [`write()`] makes. The checksum of version 1 leaves out dtypes and shapes, and may be missing.
+/// Version of the files that [`write()`] makes and [`read()`] accepts.
 pub const VERSION: u32 = 2;
 /// Entries of the metadata.
 const HEADER: &str = "endless";
@@ -43,7 +43,7 @@ pub enum FileError {
     #[error("is damaged: its header cannot be read: {0}")]
     Header(#[from] serde_json::Error),
     /// Another version of this program wrote it.
-    #[error("must be of version 1 to {VERSION}, got {given}")]
+    #[error("must be of version {VERSION}, got {given}")]
     Version { given: u32 },
     /// A byte has changed since the file was written.
     #[error("is damaged: its checksum differs")]
@@ -78,16 +78,14 @@ pub fn read(content: &[u8]) -> Result<File<'_>, FileError> {
     let metadata = SafeTensors::read_metadata(content)?.1;
     let entry = |name| metadata.metadata().as_ref().and_then(|entries| entries.get(name)).cloned();
     let (header, expected) = (entry(HEADER), entry(CHECKSUM));
-    let version = match &header {
-        Some(text) => serde_json::from_str::<Versioned>(text)?.version,
-        None => VERSION,
-    };
-    if !(1..=VERSION).contains(&version) {
-        return Err(FileError::Version { given: version });
+    if let Some(text) = &header {
+        let given = serde_json::from_str::<Versioned>(text)?.version;
+        if given != VERSION {
+            return Err(FileError::Version { given });
+        }
     }
-    let is_required = header.is_some() && version > 1;
-    let sum = || checksum(version, header.as_deref().unwrap_or_default(), &tensors.tensors());
-    if expected.map_or(is_required, |expected| expected != sum()) {
+    let sum = || checksum(header.as_deref().unwrap_or_default(), &tensors.tensors());
+    if expected.map_or(header.is_some(), |expected| expected != sum()) {
         return Err(FileError::Checksum);
     }
     Ok(File { tensors, header })
@@ -97,23 +95,21 @@ pub fn read(content: &[u8]) -> Result<File<'_>, FileError> {
 ///
 /// The tensors must have different names. Fails with [`SafeTensorError`] if a view's data do not fit its shape.
 pub fn write(header: String, tensors: Vec<(String, TensorView<'_>)>) -> Result<Vec<u8>, SafeTensorError> {
-    let sum = checksum(VERSION, &header, &tensors);
+    let sum = checksum(&header, &tensors);
     let metadata = [(HEADER.to_owned(), header), (CHECKSUM.to_owned(), sum)];
     safetensors::serialize(tensors, Some(metadata.into_iter().collect()))
 }
 
 #[inline]
-fn checksum(version: u32, header: &str, tensors: &[(String, TensorView<'_>)]) -> String {
+fn checksum(header: &str, tensors: &[(String, TensorView<'_>)]) -> String {
     // Less code than sorting, 2 kB of the page.
     let mut names: BinaryHeap<_> = tensors.iter().enumerate().map(|(i, (name, _))| Reverse((name, i))).collect();
     let mut sum = crc32fast::Hasher::new();
     sum.update(header.as_bytes());
     while let Some(Reverse((name, i))) = names.pop() {
         let (mut text, view) = (name.clone(), &tensors[i].1);
-        if version > 1 {
-            // Writing to a string does not fail.
-            let _ = write!(text, " {:?} {:?}", view.dtype(), view.shape());
-        }
+        // Writing to a string does not fail.
+        let _ = write!(text, " {:?} {:?}", view.dtype(), view.shape());
         sum.update(text.as_bytes());
         sum.update(view.data());
     }

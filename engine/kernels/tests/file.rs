@@ -86,8 +86,12 @@ fn every_changed_part_is_refused() {
             }),
         );
     }
-    for header in ["", "{}", "[", r#"{"version":0,"steps":64}"#, r#"{"version":3,"steps":64}"#] {
+    for header in ["", "{}", "["] {
         refused(header, &whole(header));
+    }
+    for version in [0, 1, 3] {
+        let other = whole(&format!(r#"{{"version":{version},"steps":64}}"#));
+        assert!(matches!(read(&other), Err(FileError::Version { given }) if given == version));
     }
     for header in [r#"{"version":1,"steps":64}"#, r#"{"version":2,"steps":65}"#, r#"{"version":2,"stops":64}"#] {
         refused(header, &changed(&file, |all| all["__metadata__"]["endless"] = json!(header)));
@@ -95,27 +99,9 @@ fn every_changed_part_is_refused() {
 }
 
 #[test]
-fn older_files_and_weights_of_other_programs_are_read() {
-    let tensors = whole(HEADER);
-    let tensors = SafeTensors::deserialize(&tensors).unwrap();
-    let file = |entries: &[(&str, &str)]| {
-        let entries = entries.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect();
-        safetensors::serialize(tensors.iter(), Some(entries)).unwrap()
-    };
-    assert!(read(&file(&[])).unwrap().header.is_none());
-    let header = r#"{"version":1}"#;
-    assert!(read(&file(&[("endless", header)])).is_ok());
-    // zlib.crc32 of the header, then of each name and its data.
-    let mut sum = crc32fast::Hasher::new();
-    sum.update(header.as_bytes());
-    for name in ["a", "b", "state/c"] {
-        sum.update(name.as_bytes());
-        sum.update(tensors.tensor(name).unwrap().data());
-    }
-    let sum = format!("{:08x}", sum.finalize());
-    let old = file(&[("endless", header), ("crc32", &sum)]);
-    assert!(read(&old).is_ok());
-    let mut damaged = old.clone();
-    *damaged.last_mut().unwrap() ^= 1;
-    assert!(matches!(read(&damaged), Err(FileError::Checksum)));
+fn weights_of_other_programs_are_read() {
+    let file = whole(HEADER);
+    let tensors = SafeTensors::deserialize(&file).unwrap().tensors();
+    let weights = safetensors::serialize(tensors, None).unwrap();
+    assert!(read(&weights).unwrap().header.is_none());
 }

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use endless_gym_kernels::file::{self, File};
 use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 
@@ -177,20 +178,17 @@ fn an_agent_of_a_file_plays() {
     }
     // A file whose evaluation measured no success, as in endless environments, and one of an environment that is not on the page.
     let whole = std::fs::read(folder.join("retnet.safetensors")).unwrap();
+    let File { tensors, header } = file::read(&whole).unwrap();
+    let header = header.unwrap();
     let file = std::env::temp_dir().join(format!("endless-page-{}.safetensors", std::process::id()));
-    let open = |browser: &mut Chromium, from: &str, at_end: u8| {
-        let mut bytes = whole.clone();
-        for at in 0..bytes.len() - from.len() {
-            if bytes[at..].starts_with(from.as_bytes()) {
-                bytes[at + from.len() - 1] = at_end;
-            }
-        }
-        std::fs::write(&file, bytes).unwrap();
+    let open = |browser: &mut Chromium, from: &str, to: &str| {
+        let changed = file::write(header.replace(from, to), tensors.tensors()).unwrap();
+        std::fs::write(&file, changed).unwrap();
         browser.choose("#file", &file);
     };
-    open(&mut browser, "success", b'.');
+    open(&mut browser, "success", "other");
     browser.wait("document.getElementById('trained').textContent.endsWith('steps; its mean return is 0.02 with command count 1; its mean return is 0.02 with command count 2.')");
-    open(&mut browser, ID, b'9');
+    open(&mut browser, ID, "MortarMayhem-Grid-v9");
     browser.wait(
         "document.getElementById('message').textContent.endsWith('MortarMayhem-Grid-v9, which is not on this page')",
     );
