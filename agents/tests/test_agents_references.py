@@ -1,4 +1,4 @@
-"""The memories of linear recurrences equal their authors' layers, recorded in float64: see references/README.md."""
+"""Memories equal their authors' layers with the same weights, recorded in float64: see the two READMEs in `references`."""
 
 from __future__ import annotations
 
@@ -6,21 +6,31 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
+from torch.nn import functional
 
 from endless_gym_agents.memories import attention
+from endless_gym_agents.memories.ffm import FFM
+from endless_gym_agents.memories.gated import LSTM
 from endless_gym_agents.memories.gated_deltanet import GatedDeltaNet
 from endless_gym_agents.memories.lru import LRU
 from endless_gym_agents.memories.mamba2 import Mamba2
+from endless_gym_agents.memories.mingru import MinGRU
 from endless_gym_agents.memories.mlstm import MLSTM
+from endless_gym_agents.memories.recurrent import RecurrentMemory
 from endless_gym_agents.memories.retnet import RetNet
 from endless_gym_agents.memories.scans import steps_of_episode
 from endless_gym_agents.memories.sequence_model import SequenceModel, Stack, State
+from endless_gym_agents.memories.shm import SHM
+from endless_gym_agents.memories.transformer import MASKED, Attention, Gate, normalised
+from endless_gym_agents.settings import Recurrence, Transformer
 
 FOLDER = Path(__file__).parent / "references"
 WIDTH, HEADS = 16, 2
@@ -155,6 +165,77 @@ def mlstm_states(final: Arrays) -> State:
     return {"c": c, "m": final["m"].reshape(c.shape[:2]), "convolution": final["conv"][:, 1:]}
 
 
+def ffm_weights(w: Arrays) -> Arrays:
+    """Their rates have the other sign, the parts of the first layer another order, and real and imaginary parts alternate."""
+
+    def parts(layer: Tensor) -> Tensor:
+        entry, through, entry_gate, gate = layer.split([6, 16, 6, 16])
+        return torch.cat([entry, entry_gate, through, gate])
+
+    return {
+        "enter.weight": parts(w["pre.weight"]),
+        "enter.bias": parts(w["pre.bias"]),
+        "a": -w["ffa.a"].flatten(),
+        "b": w["ffa.b"].flatten(),
+        "mix.weight": w["mix.weight"].unflatten(1, (-1, 2)).mT.flatten(1),
+        "mix.bias": w["mix.bias"],
+    }
+
+
+def ffm_states(final: Arrays) -> State:
+    return {"real": final["step_state"].real, "imaginary": final["step_state"].imag}
+
+
+class MinGRUWithoutBiases(MinGRU):
+    """The layer of minGRU-pytorch, which has an output layer if its width is not that of the inputs."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__(WIDTH, width, positive=True)
+        self.projection = nn.Linear(WIDTH, 2 * width, bias=False)
+        self.leave = nn.Identity() if width == WIDTH else nn.Linear(width, WIDTH, bias=False)
+
+    def step(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        h, after = super().step(x, state)
+        return self.leave(h), after
+
+    def sequence(self, x: Tensor, state: State, resets: Tensor) -> tuple[Tensor, State]:
+        h, after = super().sequence(x, state, resets)
+        return self.leave(h), after
+
+
+def mingru_weights(w: Arrays) -> Arrays:
+    candidate, gate = w["to_hidden_and_gate.weight"].chunk(2)
+    leave = {"leave.weight": w["to_out.weight"]} if "to_out.weight" in w else {}
+    return {"projection.weight": torch.cat([gate, candidate])} | leave
+
+
+def mingru_states(final: Arrays) -> State:
+    return {"h": final["hidden"].squeeze(1)}
+
+
+class DrawnRows(SHM):
+    """Takes the rows of theta that the authors' code drew for each sequence of a file."""
+
+    def __init__(self, name: str, limit: float | None = None) -> None:
+        super().__init__(WIDTH, WIDTH, 24, limit=limit)
+        self.drawn = recorded(name)[""]["rows"]
+
+    def rows(self, time: Tensor) -> Tensor:
+        return self.drawn[torch.arange(len(self.drawn)), time.squeeze(-1).long()]
+
+
+def shm_weights(w: Arrays) -> Arrays:
+    order = ("query", "key", "value", "vc_net", "eta")
+    ours = {"theta": w["theta_matrix"], "enter.weight": torch.cat([w[f"{each}.weight"] for each in order])}
+    kept = {"norm": "norm", "out": "leave", "shortcut": "shortcut"}
+    names = [(name, name.split(".")) for name in w if name.split(".")[0] in kept]
+    return ours | {f"{kept[layer]}.{part}": w[name] for name, (layer, part) in names}
+
+
+def shm_states(final: Arrays) -> State:
+    return {"m": final["state"].flatten(0, -3)}
+
+
 @dataclass(frozen=True)
 class Reference:
     """A recorded layer.
@@ -187,15 +268,26 @@ REFERENCES = {
     ),
     # The authors' gain is 1 + weight.
     "mlstm_layer": Reference(lambda _: MLSTM(WIDTH, WIDTH, HEADS), mlstm_weights, mlstm_states, {"norm": 1.0}),
+    "ffm": Reference(lambda _: FFM(WIDTH, WIDTH, 6, 3), ffm_weights, ffm_states),
+    "mingru": Reference(lambda _: MinGRUWithoutBiases(WIDTH), mingru_weights, mingru_states),
+    "mingru_expanded": Reference(lambda _: MinGRUWithoutBiases(24), mingru_weights, mingru_states),
+    "shm": Reference(lambda _: SHM(WIDTH, WIDTH, 8, stride=0, shortcut=False), shm_weights, shm_states),
+    "shm_stride37": Reference(lambda _: SHM(WIDTH, WIDTH, 8, stride=37, shortcut=False), shm_weights, shm_states),
+    "shm_pomdp": Reference(lambda _: DrawnRows("shm_pomdp"), shm_weights, shm_states),
+    "shm_pomdp_clamped": Reference(lambda _: DrawnRows("shm_pomdp_clamped", 100.0), shm_weights, shm_states),
 }
 
 
 def recorded(name: str) -> dict[str, Arrays]:
-    """The arrays of a file by the part of their name before the first point; `output`, `probe` and `input` under an empty one."""
+    """The arrays of a file by the part of their name before the first point; `output`, `probe` and `input` under an empty one.
+
+    Sequences are (B, T, width), also of files that are time-major.
+    """
     parts: dict[str, Arrays] = {}
     for key, array in np.load(FOLDER / f"{name}.npz").items():
         part, _, rest = key.rpartition(".") if key.count(".") == 0 else key.partition(".")
-        parts.setdefault(part, {})[rest] = torch.from_numpy(array)
+        batch_first = array.swapaxes(0, 1) if array.shape == (48, 3, WIDTH) else array
+        parts.setdefault(part, {})[rest] = torch.from_numpy(batch_first)
     return parts
 
 
@@ -213,6 +305,11 @@ def initial(layer: SequenceModel, batch: int) -> State:
     return {name: torch.zeros(batch, *shape) for name, shape in layer.state_shapes.items()}
 
 
+def first_state(layer: SequenceModel, arrays: dict[str, Arrays]) -> State:
+    """The state before the first step, which only a file of minGRU has."""
+    return {"h": arrays["initial"]["hidden"].squeeze(1)} if "initial" in arrays else initial(layer, 3)
+
+
 def difference(found: Tensor, expected: Tensor) -> float:
     """The largest difference, relative to the largest number."""
     assert found.shape == expected.shape
@@ -221,9 +318,10 @@ def difference(found: Tensor, expected: Tensor) -> float:
 
 def run(layer: SequenceModel, name: str) -> tuple[Tensor, State, Tensor]:
     """Outputs (B, T, width), the state after the last step, and the inputs."""
-    x = recorded(name)[""]["input"].requires_grad_()
+    arrays = recorded(name)
+    x = arrays[""]["input"].requires_grad_()
     resets = torch.zeros(x.shape[1], len(x), dtype=torch.bool)
-    y, state = layer.sequence(x.transpose(0, 1), initial(layer, len(x)), resets)
+    y, state = layer.sequence(x.transpose(0, 1), first_state(layer, arrays), resets)
     return y.transpose(0, 1), state, x
 
 
@@ -237,7 +335,7 @@ def test_outputs_and_gradients_are_those_of_the_authors(name: str, chunk: int, m
     (y * arrays[""]["probe"]).sum().backward()
     gradients = {key: part.grad for key, part in layer.named_parameters()}
     expected = reference.weights(arrays["grad"])
-    assert max(difference(gradients[key], expected[key]) for key in expected) < 1e-10
+    assert all(difference(gradients[key], expected[key]) < 1e-10 for key in expected)
     assert difference(x.grad, arrays["grad"]["input"]) < 1e-10
 
 
@@ -247,7 +345,7 @@ def test_single_steps_and_states_are_those_of_the_authors(name: str, monkeypatch
     monkeypatch.setattr(attention, "CHUNK", 16)
     layer, reference, arrays = layer_of(name), REFERENCES[name], recorded(name)
     y, after, x = run(layer, name)
-    state, outputs = initial(layer, len(x)), []
+    state, outputs = first_state(layer, arrays), []
     for inputs in x.unbind(1):
         output, state = layer.step(inputs, state)
         outputs.append(output)
@@ -391,3 +489,113 @@ def test_what_follows_in_the_block_is_gated_and_residual() -> None:
         torch.testing.assert_close(
             y, block.norms[1](mixed + (activation(u) * v) @ layer.feed_forward.leave.weight.T), rtol=1e-12, atol=1e-12
         )
+
+
+def test_relative_attention_and_gates_are_those_of_the_gtrxl_of_di_engine() -> None:
+    """Its network, made of our attention and gates.
+
+    Its projections have biases. Those of keys and positions add a constant to all scores of a query; those of queries and values
+    are a part of the other biases. It takes queries from inputs that are not normalised, divides scores by the root of a head's
+    size, and has a ReLU after the attention and two layers after that.
+    """
+    record = recorded("gtrxl")
+    theirs = {name: part.requires_grad_() for name, part in record["weight"].items()}
+    attend = Attention(Transformer(width=16, heads=2, shared_heads=False, positional_encoding="relative"))
+    attend.scale, gate = 8**-0.5, Gate(16, 2.0)
+    x, memory = record[""]["input"].requires_grad_(), record["initial"]["memory"].transpose(1, 2)
+    distance = 16 + torch.arange(48).unsqueeze(1) - torch.arange(64)
+    mask = torch.zeros(48, 64).masked_fill(distance < 0, MASKED).expand(3, 1, -1, -1)
+
+    def gated(layer: str, x: Tensor, y: Tensor) -> Tensor:
+        parts = {"from_y": "Wr Wz Wg", "from_x": "Ur Uz", "from_reset": "Ug"}
+        weights = {
+            f"{ours}.weight": torch.cat([theirs[f"{layer}.{each}.weight"] for each in names.split()])
+            for ours, names in parts.items()
+        }
+        return functional_call(gate, weights | {"bias": theirs[f"{layer}.bg"]}, (x, y))  # type: ignore[no-any-return]
+
+    h, inputs = x, []
+    for number in range(2):
+        layer = f"layers.{number}"
+        inputs.append(h)
+
+        def of(name: str, layer: str = layer) -> tuple[Tensor, Tensor]:
+            return theirs[f"{layer}.{name}.weight"], theirs[f"{layer}.{name}.bias"]
+
+        (kv, kv_bias), (q, q_bias), (out, out_bias) = (
+            of(f"attention.{name}.0") for name in ("attention_kv", "attention_q", "project")
+        )
+        keys, values = kv.chunk(2)
+        weights = {
+            "queries.weight": q,
+            "keys.weight": keys,
+            "values.weight": values,
+            "fc_out.weight": out,
+            "fc_out.bias": out_bias + out @ kv_bias.chunk(2)[1],
+            "distances.weight": of("attention.project_pos.0")[0],
+            "content_bias": (theirs["u"] + q_bias.view(2, 8)).unsqueeze(1),
+            "distance_bias": (theirs["v"] + q_bias.view(2, 8)).unsqueeze(1),
+        }
+        gain, bias = of("layernorm1")
+        tokens = normalised(torch.cat([memory[number], h], dim=1))
+        given = (h, tokens, SimpleNamespace(weight=gain, bias=bias), mask, torch.zeros(3, 48, 1).bool(), distance, None)
+        h = gated(f"{layer}.gate1", h, functional_call(attend, weights, given).relu())
+        y = functional.layer_norm(h, (16,), *of("layernorm2"))
+        for part in ("mlp.0.0", "mlp.2.0"):
+            y = functional.linear(y, *of(part)).relu()
+        h = gated(f"{layer}.gate2", h, y)
+    assert difference(h, record[""]["output"]) < 1e-10
+    inputs.append(h)
+    after = torch.stack([part[:, -16:].transpose(0, 1) for part in inputs])
+    assert difference(after, record["final"]["memory"]) < 1e-10
+    (h * record[""]["probe"]).sum().backward()
+    assert x.grad is not None and difference(x.grad, record["grad"]["input"]) < 1e-10
+    for name, weight in theirs.items():
+        found, expected = weight.grad, record["grad"][name]
+        if "project_pos.0.bias" in name:
+            assert found is None and float(expected.abs().max()) < 1e-10
+            continue
+        assert found is not None, name
+        if "attention_kv.0.bias" in name:
+            assert float(expected[:16].abs().max()) < 1e-10
+            found, expected = found[16:], expected[16:]
+        assert difference(found, expected) < 1e-10, name
+
+
+def test_ffm_starts_with_the_rates_of_the_authors_and_keeps_their_limits() -> None:
+    layer = FFM(64, 64)
+    rates = torch.tensor([0.6731472, 0.0044972366])
+    torch.testing.assert_close(layer.a[[0, -1]], rates, rtol=1e-6, atol=0)
+    torch.testing.assert_close(layer.a.diff(), torch.full((31,), (0.0044972366 - 0.6731472) / 31), rtol=1e-4, atol=0)
+    torch.testing.assert_close(2 * torch.pi / layer.b, torch.tensor([1.0, 342, 683, 1024]), rtol=1e-5, atol=0)
+    layer.a.data[:2] = torch.tensor([3.0, -1.0])
+    magnitudes = layer.gamma().abs()[:2, 0]
+    torch.testing.assert_close(magnitudes, torch.tensor([-0.6831472, -1e-8]).exp())
+    assert layer.a[0].item() == pytest.approx(0.6831472) and layer.a[1].item() == pytest.approx(1e-8)
+
+
+def test_shm_starts_as_that_of_the_authors() -> None:
+    torch.manual_seed(1)
+    layer, spread = SHM(64, 64), lambda part: float(part.detach().abs().max())
+    assert 0.19 < spread(layer.theta) <= (6 / (128 + 32)) ** 0.5
+    assert all(0.12 < spread(part) <= 0.125 for part in layer.enter.weight.split([32] * 4 + [1]))
+    assert 0.17 < spread(layer.leave.weight) <= 32**-0.5
+
+
+def test_mingru_with_a_positive_candidate_starts_as_that_of_the_authors() -> None:
+    torch.manual_seed(1)
+    layer = MinGRU(64, 64, positive=True)
+    assert 0.12 < float(layer.projection.weight.detach().abs().max()) <= 0.125
+    z, candidate = layer.projected(torch.randn(2000, 64)).detach().chunk(2, -1)
+    decays = (1 - z.sigmoid()).quantile(torch.tensor([0.05, 0.5, 0.95]))
+    torch.testing.assert_close(decays, torch.tensor([0.28, 0.5, 0.72]), rtol=0, atol=0.03)
+    assert bool((candidate > 0).all()) and float(candidate.mean()) == pytest.approx(0.68, abs=0.03)
+
+
+@pytest.mark.parametrize("bias", [0.0, 1.0])
+def test_the_forget_gates_of_lstms_start_with_the_given_bias(bias: float) -> None:
+    memory = RecurrentMemory("lstm", 5, Recurrence(4, layers=2, forget_bias=bias), torch.device("cpu"))
+    assert isinstance(memory.model, LSTM)
+    for _, _, of_inputs, of_states in memory.model.all_weights:
+        gates = (of_inputs + of_states).unflatten(0, (4, 4))
+        assert gates[1].tolist() == [bias] * 4 and not gates[[0, 2, 3]].any()
