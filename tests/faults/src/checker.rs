@@ -23,7 +23,7 @@ pub enum Request {
 impl Request {
     /// A random request to a group that has been reset.
     pub fn random(draws: &mut Generator, shape: &Shape, space: &ActionSpace, with_options: bool) -> Self {
-        let num_envs = shape.num_envs;
+        let num_envs = shape.pool.num_envs;
         if draws.integers(0, 40) == 0 {
             // An unseeded episode depends on earlier ones, so each environment is reset with a seed or not at all.
             let mut item = || match draws.integers(0, 2) {
@@ -31,7 +31,7 @@ impl Request {
                 _ => EnvReset::Seed(draws.integers(0, 1 << 32) as u64),
             };
             let each = (0..num_envs).map(|_| item()).collect();
-            let options = (with_options && draws.integers(0, 2) == 0).then(|| options::random(draws, &shape.id));
+            let options = (with_options && draws.integers(0, 2) == 0).then(|| options::random(draws, &shape.pool.id));
             return Request::Each { each, options };
         }
         Request::Step((0..num_envs).flat_map(|_| space.sample(draws)).collect())
@@ -60,18 +60,19 @@ pub struct Twin {
 
 impl Twin {
     pub fn new(shape: &Shape, group: usize) -> Result<Self, PoolError> {
-        let pool = Pool::new(environments(), &shape.pool(group), &Threads::new(1)?)?;
+        let pool = Pool::new(environments(), &shape.group(group), &Threads::new(1)?)?;
         let buffers = (0..3).map(|_| zeroed(pool.layout().blocks())).collect();
-        let shows_history = shape.id.contains("SearingSpotlights") || shape.id.contains("Endless-MortarMayhem");
+        let shows_history =
+            shape.pool.id.contains("SearingSpotlights") || shape.pool.id.contains("Endless-MortarMayhem");
         Ok(Twin { pool, buffers, shows_history, is_exact: true })
     }
 
     /// The difference between an engine's specification and the expected one, if any.
     pub fn difference(&self, shape: &Shape, specification: &ServiceSpecification) -> Option<String> {
-        let space = environments().spec(&shape.id).map(|spec| &spec.action_space).ok();
+        let space = environments().spec(&shape.pool.id).map(|spec| &spec.action_space).ok();
         let same = specification.batch == *self.pool.layout()
             && Some(&specification.action_space) == space
-            && specification.autoreset == shape.autoreset;
+            && specification.autoreset == shape.pool.autoreset;
         (!same).then(|| format!("specification {specification:?} is not that of {shape:?}"))
     }
 

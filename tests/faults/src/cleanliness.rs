@@ -27,6 +27,11 @@ pub fn run(namespace: &Namespace) -> PathBuf {
     namespace.root().with_extension("run")
 }
 
+/// The file with the configuration of a round's engine.
+pub fn config(namespace: &Namespace) -> PathBuf {
+    namespace.root().with_extension("json")
+}
+
 /// Finds the files in a folder and its subfolders.
 pub fn below(folder: &Path, found: &mut Vec<PathBuf>) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
@@ -81,7 +86,7 @@ pub fn set_age(namespace: &Namespace, seconds: i64) {
 
 /// Removes everything, whatever it is.
 pub fn remove_all(namespace: &Namespace) {
-    for path in files(namespace) {
+    for path in files(namespace).into_iter().chain([config(namespace)]) {
         let _ = fs::remove_file(path);
     }
     for folder in [namespace.root(), &run(namespace)] {

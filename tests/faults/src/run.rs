@@ -60,8 +60,8 @@ pub fn run(args: &Args) -> Result<(), String> {
         println!(
             "round {number}: {} x {} of {}, {} faults, {} batches, {} failures",
             plan.shape.groups,
-            plan.shape.num_envs,
-            plan.shape.id,
+            plan.shape.pool.num_envs,
+            plan.shape.pool.id,
             outcome.faults.len(),
             outcome.batches,
             outcome.failures.len()

@@ -1,6 +1,7 @@
 //! A round's processes, and the rules that judge their reports and exits.
 
 use std::collections::{HashMap, HashSet};
+use std::fs;
 use std::os::unix::process::ExitStatusExt;
 use std::process::{Command, ExitStatus};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -10,6 +11,7 @@ use endless_gym_service::{Namespace, ROOT_VARIABLE};
 use rustix::process::Signal;
 
 use crate::actors::{self, Actor, is_crash};
+use crate::cleanliness;
 use crate::event::{Event, now};
 use crate::ledger::Ledger;
 use crate::others::Habit;
@@ -113,8 +115,11 @@ impl<'a> Scene<'a> {
         let seed = self.plan.trainer_seed.wrapping_add(self.started);
         match role {
             Role::Engine => {
+                let config = cleanliness::config(&self.namespace);
+                let json = serde_json::to_vec(&self.plan.shape.engine(&self.namespace)).map_err(|e| e.to_string())?;
+                fs::write(&config, json).map_err(|e| format!("{}: {e}", config.display()))?;
                 let mut engine = Command::new(actors::engine_program()?);
-                engine.args(self.plan.shape.arguments());
+                engine.args(["serve", "--child", "--config"]).arg(config);
                 Ok(engine)
             }
             Role::Trainer => {

@@ -239,7 +239,11 @@ fn phase(
         if start.elapsed().as_secs() / 60 > minute {
             minute += 1;
             let failures = scene.outcome.failures.len();
-            println!("minute {minute}: {}: {} steps, {failures} failures", plan.shape.id, steps(&scene.outcome, plan));
+            println!(
+                "minute {minute}: {}: {} steps, {failures} failures",
+                plan.shape.pool.id,
+                steps(&scene.outcome, plan)
+            );
             println!(
                 "    {:?}",
                 COUNTERS.iter().map(|(name, _)| name).zip(usages.last().into_iter().flatten()).collect::<Vec<_>>()
@@ -249,8 +253,8 @@ fn phase(
     // A very short run is not judged, since its processes are still starting.
     if usages.len() >= 30 {
         let shape = &plan.shape;
-        let dark = if shape.id.contains("SearingSpotlights") { DARK_PICTURES } else { 0 };
-        let memory = MEMORY + dark * (shape.groups * shape.num_envs) as u64;
+        let dark = if shape.pool.id.contains("SearingSpotlights") { DARK_PICTURES } else { 0 };
+        let memory = MEMORY + dark * (shape.groups * shape.pool.num_envs) as u64;
         for grown in growth(&usages, memory) {
             scene.fail("growth", grown);
         }
@@ -270,5 +274,5 @@ fn phase(
 }
 
 fn steps(outcome: &Outcome, plan: &Plan) -> u64 {
-    outcome.batches * plan.shape.num_envs as u64
+    outcome.batches * plan.shape.pool.num_envs as u64
 }

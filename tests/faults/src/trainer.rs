@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use endless_gym_core::pool::PoolError;
+use endless_gym_core::pool::{PoolError, ResetOptions};
 use endless_gym_core::random::Generator;
 use endless_gym_service::{BatchLease, ConnectConfig, GroupReconnection, LastRequest, ServiceError, Trainer};
 use nix::unistd::ForkResult;
@@ -184,13 +184,16 @@ impl<'a> Play<'a> {
         let (shape, space) = (&self.work.shape, trainer.specification().action_space.clone());
         for (index, group) in self.groups.iter_mut().enumerate().filter(|(_, group)| group.pending.is_none()) {
             if group.was_reset && draws.integers(0, 60) == 0 {
-                snapshot(&mut group.twin, trainer, index, draws.integers(0, shape.num_envs as i64) as usize)?;
+                snapshot(&mut group.twin, trainer, index, draws.integers(0, shape.pool.num_envs as i64) as usize)?;
             }
             let request = if group.was_reset {
                 Request::random(draws, shape, &space, self.work.with_options)
             } else {
                 // An earlier trainer may have changed the options.
-                let options = self.work.with_options.then(|| shape.options.clone());
+                let options = match &shape.pool.options {
+                    ResetOptions::Shared(options) if self.work.with_options => Some(options.clone()),
+                    _ => None,
+                };
                 Request::Seed { seed: self.work.seed, options }
             };
             request.send(trainer, index).map_err(failed("send"))?;
