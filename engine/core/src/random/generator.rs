@@ -1,12 +1,9 @@
 //! The methods of numpy's `Generator` that the environments use.
 
-use std::fmt;
-
 use rand::Rng;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 
-use super::entropy::{EntropyError, entropy};
 use super::seed_sequence::SeedSequence;
 use super::ziggurat::{HEIGHT, INSIDE, TAIL, WIDTH};
 
@@ -21,15 +18,13 @@ const MAX_REDRAWS: u32 = 1024;
 ///
 /// // numpy.random.default_rng(42).integers(0, 10, 5) and .random()
 /// let mut rng = Generator::from_seed(42);
-/// let mut values = [0; 5];
-/// rng.fill_integers(0, 10, &mut values);
-/// assert_eq!(values, [0, 7, 6, 4, 4]);
+/// assert_eq!([(); 5].map(|()| rng.integers(0, 10)), [0, 7, 6, 4, 4]);
 /// assert_eq!(Generator::from_seed(42).random(), 0.7739560485559633);
 /// ```
 ///
 /// Sources: `numpy/random/_generator.pyx`, `src/distributions/distributions.c` and
 /// `src/pcg64/pcg64.h` (numpy 1.26 and 2.x).
-#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "UncheckedGenerator")]
 pub struct Generator {
     /// The bit generator, with 64 bits per step.
@@ -52,16 +47,6 @@ impl Generator {
         Self { bits: Pcg64::new(join(state_high, state_low), join(stream_high, stream_low)), kept: None }
     }
 
-    /// An unseeded generator, `Generator(PCG64())`, from 128 bits of the operating system's [`entropy`], as in Gymnasium for a
-    /// reset without a seed.
-    ///
-    /// # Errors
-    ///
-    /// If no entropy is available; see [`entropy`].
-    pub fn from_entropy() -> Result<Self, EntropyError> {
-        Ok(Self::from_seed_sequence(&SeedSequence::from_u128(entropy()?)))
-    }
-
     /// `integers(low, high)`: a uniform integer in `low..high`, by numpy's `int64` path. numpy truncates float arguments
     /// towards zero.
     ///
@@ -75,13 +60,6 @@ impl Generator {
         // The size of the range: 2 to 2⁶⁴ - 1, exact despite the wrapping.
         let count = high.wrapping_sub(low) as u64;
         low.wrapping_add_unsigned(self.below(count))
-    }
-
-    /// `integers(low, high, size)`: fills `values`, with the same draws as that many calls of [`integers`](Self::integers), as
-    /// in numpy.
-    #[inline]
-    pub fn fill_integers(&mut self, low: i64, high: i64, values: &mut [i64]) {
-        values.fill_with(|| self.integers(low, high));
     }
 
     /// `choice(items)`: one of the items, with equal probabilities. Draws nothing for a single item.
@@ -272,18 +250,6 @@ impl TryFrom<UncheckedGenerator> for Generator {
             return Err("the increment of PCG64 must be odd");
         }
         Ok(Self { bits, kept })
-    }
-}
-
-/// Shows the whole state, which the `Debug` of `rand_pcg` omits.
-impl fmt::Debug for Generator {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter
-            .debug_struct("Generator")
-            .field("state", &self.bits.state())
-            .field("stream", &self.bits.stream())
-            .field("kept", &self.kept)
-            .finish()
     }
 }
 

@@ -111,14 +111,9 @@ mod tests {
                 let place = format!("seed {}, draw {at}", case.seed);
                 match *draw {
                     Draw::Integers(low, high, ref expected) => {
-                        let mut filler = rng.clone();
-                        let mut filled = vec![0; expected.len()];
-                        filler.fill_integers(low, high, &mut filled);
-                        assert_eq!(&filled, expected, "{place}");
                         for &value in expected {
                             assert_eq!(rng.integers(low, high), value, "{place}");
                         }
-                        assert_eq!(rng, filler, "{place}");
                     }
                     Draw::Choice(length, expected) => {
                         assert_eq!(*rng.choice(&indices[..length]), expected, "{place}");
@@ -168,13 +163,12 @@ mod tests {
             assert_eq!(restored.integers(-45, 45), rng.integers(-45, 45));
             assert_eq!(restored.random(), rng.random());
         }
-        assert_eq!(format!("{restored:?}"), format!("{rng:?}"));
     }
 
     #[cfg(feature = "entropy")]
     #[test]
     fn unseeded_generators_differ() {
-        assert_ne!(Generator::from_entropy().unwrap(), Generator::from_entropy().unwrap());
+        assert_ne!(super::entropy().unwrap(), super::entropy().unwrap());
     }
 
     #[test]
@@ -209,14 +203,6 @@ mod tests {
                 let value = rng.integers(low, high);
                 prop_assert!(value == low || (low..high).contains(&value));
             }
-        }
-
-        #[test]
-        fn integers_stay_in_short_ranges(seed: u64, low: i64, length in 1..1000_i64) {
-            let high = low.saturating_add(length);
-            let mut values = [0; 40];
-            Generator::from_seed(seed).fill_integers(low, high, &mut values);
-            prop_assert!(values.iter().all(|&value| value == low || (low..high).contains(&value)));
         }
 
         #[test]
