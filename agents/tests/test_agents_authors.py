@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from endless_gym_agents.memories.memory import AnyMemory
 from endless_gym_agents.memories.recurrent import RecurrentMemory, RecurrentMinibatch, RecurrentState
-from endless_gym_agents.memories.transformer import MASKED, Attention, TransformerMemory
+from endless_gym_agents.memories.transformer import TransformerMemory
+from endless_gym_agents.memories.transformer_block import MASKED, Attention
 from endless_gym_agents.settings import Recurrence, Transformer
 
 RECORDED = json.loads(gzip.decompress((Path(__file__).parent / "authors.json.gz").read_bytes()))["cases"]

@@ -9,7 +9,8 @@ from agents_helpers import BRANCHES, ends, loss_of, make, observations, play, se
 
 from endless_gym_agents.agent.agent import Agent, AgentMemory
 from endless_gym_agents.agent.encoders import FRAME
-from endless_gym_agents.memories.transformer import Block, TransformerMemory
+from endless_gym_agents.memories.transformer import TransformerMemory
+from endless_gym_agents.memories.transformer_block import Block
 from endless_gym_agents.settings import PRESETS, Recurrence
 from endless_gym_agents.training.rollout import Segment
 

@@ -13,7 +13,8 @@ from endless_gym_agents.agent.agent import Agent, make_agent
 from endless_gym_agents.agent.encoders import FRAME, FRAMES_PER_CHUNK, AtariEncoder
 from endless_gym_agents.agent.heads import PolicyHead, ReconstructionHead
 from endless_gym_agents.evaluation import curves
-from endless_gym_agents.memories.transformer import Block, TransformerMemory
+from endless_gym_agents.memories.transformer import TransformerMemory
+from endless_gym_agents.memories.transformer_block import Block
 from endless_gym_agents.settings import PRESETS, Recurrence, Transformer, from_dict, to_dict
 from endless_gym_agents.training.train import parse
 

@@ -29,7 +29,7 @@ from endless_gym_agents.memories.retnet import RetNet
 from endless_gym_agents.memories.scans import steps_of_episode
 from endless_gym_agents.memories.sequence_model import SequenceModel, Stack, State
 from endless_gym_agents.memories.shm import SHM
-from endless_gym_agents.memories.transformer import MASKED, Attention, Gate, normalised
+from endless_gym_agents.memories.transformer_block import MASKED, Attention, Gate, normalised
 from endless_gym_agents.settings import Recurrence, Transformer
 
 FOLDER = Path(__file__).parent / "references"
