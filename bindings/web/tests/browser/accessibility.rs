@@ -42,6 +42,11 @@ fn axe_finds_nothing_serious() {
     browser.value(&format!("{axe}; 0"));
     browser.value("document.querySelectorAll('details').forEach((details) => (details.open = true))");
     assert_accessible(&mut browser, "SearingSpotlights-v0");
+    // axe-core has no rule for the names of native progress bars.
+    assert_eq!(browser.value("document.querySelectorAll('progress:not([aria-label])').length"), 0);
+    let unreachable = "[...document.querySelectorAll('button, input, select, summary')] \
+                       .filter((control) => control.checkVisibility() && control.tabIndex < 0).length";
+    assert_eq!(browser.value(unreachable), 0, "the keyboard reaches every control");
     browser
         .value("endless.start({ id: 'MortarMayhem-Grid-v0', options: {}, seed: '1' }); endless.play.choose('agent')");
     browser.wait("endless.play.player === 'agent'");
