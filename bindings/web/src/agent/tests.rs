@@ -123,13 +123,6 @@ fn a_checkpoint_of_the_trainer_plays_as_in_the_trainer() {
     std::fs::remove_dir_all(folder).unwrap();
 }
 
-#[test]
-fn an_agent_fits_only_its_environment() {
-    let agent = Agent::read(AGENT).unwrap();
-    let fitting: Vec<_> = memory_gym().specs().filter(|spec| agent.fits(spec)).map(|spec| spec.id).collect();
-    assert_eq!(fitting, ["MortarMayhem-Grid-v0"]);
-}
-
 /// A changed file with the checksum of what it now contains, so that only the agent can refuse it. One without a header has no checksum,
 /// and one that is not in the format safetensors stays as it is.
 fn sealed(file: Vec<u8>) -> Vec<u8> {
