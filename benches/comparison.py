@@ -12,6 +12,7 @@ every contender once, so that the load of other programs affects all of them.
 from __future__ import annotations
 
 import argparse
+import datetime
 import json
 import os
 import platform
@@ -165,6 +166,7 @@ def machine() -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
         "endless_gym": endless_gym.__version__,
+        "date": datetime.date.today().isoformat(),
         "load_average": os.getloadavg()[0],
     }
 
