@@ -201,7 +201,7 @@ pub fn test_agents() -> Result<(), String> {
 
 /// Runs the tests of the environments' package that compare with the original.
 pub fn test_original() -> Result<(), String> {
-    let environment = environment()?;
+    let environment = libraries()?;
     install(&environment)?;
     let paths = [("ENDLESS_ORIGINAL_PYTHON", original(false)?), ("ENDLESS_POPGYM_PYTHON", original(true)?)];
     pytest(&environment, "bindings/python", "original", &paths)
@@ -225,7 +225,7 @@ fn pytest(environment: &Path, package: &str, markers: &str, paths: &[(&str, Path
 /// Compares steps per second with the original.
 pub fn bench(arguments: &[String]) -> Result<(), String> {
     wheel("release")?;
-    let environment = environment()?;
+    let environment = libraries()?;
     install(&environment)?;
     let mut script = Command::new(environment.join("bin/python"));
     script.arg(workspace().join("benches/comparison.py")).arg("--original").arg(original(false)?);
