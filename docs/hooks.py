@@ -91,7 +91,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         file = (folder / target).resolve()
         if file in copies:
             return f"[{text}]({os.path.relpath(copies[file], here)}{anchor or ''})"
-        if not file.exists() and target not in files.src_uris and (ROOT / "docs") not in file.parents:
+        if not file.exists():
             raise PluginError(f"{page.file.src_uri}: the link {target} leads nowhere")
         if (ROOT / "docs") in file.parents:
             return f"[{text}]({os.path.relpath(file, ROOT / 'docs' / here)}{anchor or ''})"

@@ -292,8 +292,8 @@ class Settings:
     target_reward: Annotated[float | None, Range()] = None
     """stop when the mean reward of the last 100 episodes reaches this value"""
     stop_when_learnt: bool = False
-    """stop when the last 100 episodes show that the task is learnt: with a mean task progress of 90 % in Mortar Mayhem, with
-    success in 90 % of the episodes in other environments that report it. A target reward replaces it. The default of `quick`"""
+    """stop when the last 100 episodes show that the task is learnt, as `endless list ID` defines it. A target reward replaces it.
+    The default of `quick`"""
     wandb: bool = False
     """also log to Weights & Biases, if it is installed"""
     view: bool = False

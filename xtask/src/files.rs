@@ -69,6 +69,7 @@ fn versions() -> Result<(), String> {
         ("agents/pyproject.toml", format!("\nname = \"endless-gym\"\nversion = \"{version}\"\n")),
         ("README.md", rust.clone()),
         ("CONTRIBUTING.md", rust.clone()),
+        ("docs/index.md", rust.clone()),
         ("bindings/python/README.md", rust),
         ("Dockerfile", release::TOOLS[0].to_owned()),
         ("bindings/python/uv.lock", "\nname = \"maturin\"\nversion = \"1.16.0\"\n".to_owned()),

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 class Clock:
     """Accumulates the seconds of named phases.
 
-    Times are measured on the host. GPU kernels run asynchronously and count toward the phase that waits for them: those of a
-    rollout toward `inference`, which waits for the actions, and those of an update toward `learning`, which ends with a copy of
+    Times are measured on the host. GPU kernels run asynchronously and count towards the phase that waits for them: those of a
+    rollout towards `inference`, which waits for the actions, and those of an update towards `learning`, which ends with a copy of
     the metrics.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""GRU and LSTM layers on CUDA: a loop over fused cells, captured in a CUDA graph with the minibatch.
+"""GRU and LSTM layers on CUDA: a loop over fused cells.
 
 cuDNN's layers know no resets inside a sequence. A step here is a mask, a product and PyTorch's fused cell, forward and backward;
 the gradients of the weights are one product over all steps. T is the number of steps, S the number of sequences, H the hidden

@@ -1,1 +1,1 @@
-"""The paper's experiments, and the search for settings."""
+"""Experiments of many runs: those of the paper, the tracks of the leaderboard, and the search for settings."""

@@ -118,7 +118,7 @@ def orders(track: Track, comparison: Comparison) -> list[str]:
         missing = ", ".join(f"`{agent}`" for agent in agents if agent not in found)
         rows.append([each["source"], each.get("found", ""), here + (f"; no rows of {missing}" if missing else "")])
     return [
-        "## Beside published results",
+        "## Compared with published results",
         "",
         "Observations, tasks, sizes and lengths of training differ, so only orders can be compared.",
         "",

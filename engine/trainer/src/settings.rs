@@ -82,8 +82,7 @@ pub struct Settings {
     /// Stop when the mean reward of the last 100 episodes reaches this value [default: none].
     #[arg(long, allow_negative_numbers = true, value_parser = number(FINITE))]
     pub target_reward: Option<f64>,
-    /// Stop when the last 100 episodes show that the task is learnt: with a mean task progress of 90 % in Mortar Mayhem, with success in
-    /// 90 % of the episodes in other environments that report it. A target reward replaces it.
+    /// Stop when the last 100 episodes show that the task is learnt, as `endless list ID` defines it. A target reward replaces it.
     #[arg(long, default_value_t = true, action = ArgAction::Set, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub stop_when_learnt: bool,
     /// The environments.
