@@ -1,4 +1,4 @@
-"""Fail if files of a crate, or files or rooms of a Python package, import each other in a cycle, or a folder one above it.
+"""Fail if files or rooms of a crate or a Python package import each other in a cycle, or a folder one above it.
 
 Run `python xtask/cycles.py`.
 """
@@ -13,12 +13,20 @@ from pathlib import Path
 import tomllib
 
 #: The folders with code, each of which uses only itself and those before it, in Rust and in Python.
-FLOORS = ["engine", "src", "bindings", "agents"]
-PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
-#: The rooms of each package, folders and some files at its top, in the same order.
+FLOORS = [
+    ["engine/core", "engine/memory-gym", "engine/popgym", "engine/service"],
+    ["engine/*"],
+    ["."],
+    ["bindings/*"],
+    ["agents"],
+]
+#: The Python packages with their floors, and their rooms, folders and files at their top, in the same order.
+PACKAGES = {"bindings/python/endless_gym": 3, "agents/endless_gym_agents": 4}
 ROOMS = [
-    ["_native", "arguments", "specs", "display", "program", "requests", "vector", "recording", "cli"],
-    ["common", "settings", "environments", "memories", "agent", "training", "evaluation", "paper"],
+    "_native arguments interop program specs experts display requests env statistics vector replay popgym episodes create "
+    "registration pufferlib sb3 watching engine recording memory_gym torchrl cli",
+    "popgym common settings memories environments agent training checkpoint train evaluation export ruler evaluate "
+    "conformance paper",
 ]
 CRATES = [path.parent for path in sorted([*Path().glob("*/*/Cargo.toml"), Path("xtask/Cargo.toml")])]
 
@@ -120,56 +128,53 @@ def python_imports(folder: Path) -> dict[Module, set[Module]]:
     return found
 
 
-def room_imports(folder: Path) -> dict[Module, set[Module]]:
-    """For each room of a package, a folder or a file at its top, the rooms that it imports."""
+def room_imports(imports: dict[Module, set[Module]], depth: int) -> dict[Module, set[Module]]:
+    """For each room, a folder or a file at a depth, the rooms that it imports."""
     found: dict[Module, set[Module]] = {}
-    for module, imported in python_imports(folder).items():
-        found.setdefault(module[:2], set()).update({name[:2] for name in imported} - {module[:2]})
+    for module, imported in imports.items():
+        found.setdefault(module[:depth], set()).update({name[:depth] for name in imported} - {module[:depth]})
     return found
 
 
 def upward_imports() -> Iterator[str]:
     """Crates and Python files of a floor that depend on a crate or a package of a higher one."""
-    crates = {
-        tomllib.loads(path.read_text())["package"]["name"]: floor for floor in FLOORS for path in manifests(floor)
-    }
-    packages = {Path(package).name: package.split("/")[0] for package in PACKAGES}
-    for floor in FLOORS:
-        above = FLOORS[FLOORS.index(floor) + 1 :]
-        for path in manifests(floor):
-            manifest = tomllib.loads(path.read_text())
-            for kind in ("dependencies", "dev-dependencies", "build-dependencies"):
-                yield from (f"{path}: {name}" for name in manifest.get(kind, {}) if crates.get(name) in above)
-        for package in PACKAGES:
-            if package.startswith(floor):
-                for path in Path(package).rglob("*.py"):
-                    imported = re.findall(r"^\s*(?:from|import) (\w+)", path.read_text(), re.MULTILINE)
-                    yield from (f"{path}: {name}" for name in imported if packages.get(name) in above)
+    floors: dict[str, int] = {Path(package).name: floor for package, floor in PACKAGES.items()}
+    manifests = {}
+    for floor, patterns in enumerate(FLOORS):
+        for path in sorted(path for pattern in patterns for path in Path().glob(f"{pattern}/Cargo.toml")):
+            manifests[path] = tomllib.loads(path.read_text())
+            floors.setdefault(manifests[path]["package"]["name"], floor)
+    for path, manifest in manifests.items():
+        own = floors[manifest["package"]["name"]]
+        for kind in ("dependencies", "dev-dependencies", "build-dependencies"):
+            yield from (f"{path}: {name}" for name in manifest.get(kind, {}) if floors.get(name, 0) > own)
+    for package, own in PACKAGES.items():
+        for path in Path(package).rglob("*.py"):
+            imported = re.findall(r"^\s*(?:from|import) (\w+)", path.read_text(), re.MULTILINE)
+            yield from (f"{path}: {name}" for name in imported if floors.get(name, 0) > own)
 
 
 def upward_rooms() -> Iterator[str]:
-    """Rooms of Python packages that import one above their own."""
-    for package, rooms in zip(PACKAGES, ROOMS, strict=True):
-        for (_, *room), imported in room_imports(Path(package)).items():
+    """Rooms of Python packages that import one above their own, or that are not in the list."""
+    for package, names in zip(PACKAGES, ROOMS, strict=True):
+        rooms = names.split()
+        for (_, *room), imported in room_imports(python_imports(Path(package)), 2).items():
             above = rooms[rooms.index(room[0]) + 1 :] if room and room[0] in rooms else []
             yield from (f"{package}, {room[0]}: {name[1]}" for name in imported if name[1:] and name[1] in above)
-
-
-def manifests(floor: str) -> list[Path]:
-    """The manifests of a floor's crates; that of `src` is the root's."""
-    return [Path("Cargo.toml")] if floor == "src" else sorted(Path(floor).glob("*/Cargo.toml"))
+            yield from (f"{package}: the unknown room {name}" for name in room[:1] if name not in rooms)
 
 
 failed = False
 for upward in (*upward_imports(), *upward_rooms()):
     failed = True
     print(f"{upward} is of a higher folder")
-for folder, imports in [
-    *((Path(crate, "src"), rust_imports) for crate in CRATES),
-    *((Path(package), imports) for package in PACKAGES for imports in (python_imports, room_imports)),
+for folder, imports, depth in [
+    *((crate, rust_imports(crate / "src"), 1) for crate in CRATES),
+    *((Path(package), python_imports(Path(package)), 2) for package in PACKAGES),
 ]:
     try:
-        TopologicalSorter(imports(folder)).prepare()
+        TopologicalSorter(imports).prepare()
+        TopologicalSorter(room_imports(imports, depth)).prepare()
     except CycleError as error:
         failed = True
         print(

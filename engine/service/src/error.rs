@@ -10,8 +10,8 @@ use endless_gym_core::envs::ActionError;
 use endless_gym_core::pool::{PoolError, ResumeError, SnapshotError};
 use thiserror::Error;
 
-use crate::namespace::process::LockHolder;
-use crate::namespace::resource_limits;
+use crate::os::process::LockHolder;
+use crate::os::resource_limits;
 
 /// Version of this package, for messages about versions that differ.
 pub(crate) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -86,6 +86,12 @@
 //! The state of the environments ends with their engine. Whatever it executed after its last checkpoint is lost; the
 //! step number at which a resumed engine continues tells what to repeat.
 
+/// What the operating system says of processes and their limits.
+mod os {
+    pub(crate) mod process;
+    pub(crate) mod resource_limits;
+}
+
 mod error;
 
 /// What the processes of a namespace share: its directory, its locks, and the cleanup after dead processes.
@@ -101,8 +107,6 @@ mod namespace {
     pub(crate) mod members;
     pub(crate) mod memory;
     pub(crate) mod node;
-    pub(crate) mod process;
-    pub(crate) mod resource_limits;
     pub(crate) mod segments;
 }
 
@@ -155,7 +159,7 @@ pub use engine::serving::Engine;
 pub use engine::status_writer::EngineSummary;
 pub use error::{CHECKPOINT_VERSION, CheckpointError, EngineActivity, ErrorKind, Rejection, ServiceError};
 pub use namespace::directory::{Namespace, ROOT_VARIABLE};
-pub use namespace::process::LockHolder;
+pub use os::process::LockHolder;
 pub use protocol::discovery::running_engines;
 pub use protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS};
 pub use protocol::specification::ServiceSpecification;

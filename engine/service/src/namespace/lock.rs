@@ -20,7 +20,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use crate::error::ServiceError;
-use crate::namespace::process::{self, LockHolder};
+use crate::os::process::{self, LockHolder};
 
 /// Shortest wait for the lock before a process reports an error.
 pub(crate) const LOCK_TIMEOUT: Duration = Duration::from_secs(5);

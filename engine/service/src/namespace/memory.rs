@@ -14,8 +14,8 @@ use endless_gym_core::batch::BLOCK_BYTES;
 use endless_gym_core::pool::Threads;
 
 use crate::error::ServiceError;
-use crate::namespace::resource_limits;
 use crate::namespace::segments::DIRECTORY;
+use crate::os::resource_limits;
 
 /// Bytes reserved for iceoryx2's own segments and for headers.
 pub(crate) const MARGIN: u64 = 1 << 20;

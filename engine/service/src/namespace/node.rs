@@ -20,7 +20,8 @@ use crate::namespace::fork_guard::ForkGuard;
 use crate::namespace::identity::{CreationLock, Identity};
 use crate::namespace::lock::{LOCK_TIMEOUT, NamespaceLock};
 use crate::namespace::members::{self, Membership};
-use crate::namespace::{cleanup, descriptors, iceoryx_files, memory, process, segments};
+use crate::namespace::{cleanup, descriptors, iceoryx_files, memory, segments};
+use crate::os::process;
 
 /// How many times a process tries to join a namespace whose directory is removed meanwhile.
 const JOIN_ATTEMPTS: usize = 5;
