@@ -2,7 +2,7 @@
 
 use clap::ColorChoice;
 use endless_gym_core::batch::Frames;
-use endless_gym_core::envs::{ActionBranch, EnvSpec};
+use endless_gym_core::envs::{ActionBranch, EnvSpec, Learnt};
 use endless_gym_core::pool::Registry;
 use serde_json::json;
 
@@ -80,6 +80,11 @@ fn description(spec: &EnvSpec) -> String {
     parts.push(format!("observation  {}{index}", observation(spec)));
     if !spec.ground_truth.is_empty() {
         parts.push(format!("ground truth float64 ({},)", spec.ground_truth.len()));
+    }
+    if let Some(Learnt { name, mean }) =
+        spec.learnt.filter(|learnt| spec.info.iter().any(|info| info.name == learnt.name))
+    {
+        parts.push(format!("learnt       at a mean {name} of {mean}"));
     }
     for (title, parameters) in [("argument (`ID?NAME=VALUE&..`)", spec.arguments), ("reset parameter", spec.parameters)]
     {
