@@ -187,9 +187,9 @@ class PPO:
     """Proximal policy optimisation and loss coefficients."""
 
     updates: Natural = 0
-    """number of updates of the run; one update uses `num_envs * steps` environment steps. 0 for as many environment steps as the
-    paper's runs: 50,000 of its updates in endless environments, 30,000 in MortarMayhem, 25,000 or fewer in MysteryPath and
-    SearingSpotlights, 10,000 in the grids"""
+    """number of updates of the run; 0 for as many environment steps as the paper's runs: 50,000 of its updates in endless
+    environments, 30,000 in MortarMayhem, 25,000 or fewer in MysteryPath and SearingSpotlights, 10,000 in the grids. One update
+    uses `num_envs * steps` environment steps"""
     decay_updates: Positive = 10_000
     """updates over which learning rate and entropy coefficient decay linearly to their final values"""
     steps: Positive = 512
@@ -269,12 +269,12 @@ class Settings:
     run: str = ""
     """folder of the run; empty for runs/ENV/AGENT-SEED-TIME"""
     resume: str = ""
-    """resume the run in this folder from its last checkpoint; its settings are the defaults of the other flags"""
+    """resume the run in this folder from its last checkpoint; its settings are the defaults of the other options"""
     init_from: str = ""
     """start from the weights of this checkpoint, or of the last one of the run in this folder, for transfer and curricula;
     weights whose shapes differ, as those of another action space, keep their initial values. The optimizer is new"""
     total_steps: Natural = 0
-    """environment steps of the run, rounded up to a whole update; replaces --ppo.updates"""
+    """environment steps of the run, rounded up to a whole update; 0 for `--ppo.updates`, which it replaces"""
     checkpoint_interval: Positive = 100
     """updates between two checkpoints; the last update always writes a checkpoint"""
     checkpoint_minutes: FromZero = 10.0

@@ -1,5 +1,8 @@
 """Small agents and their rollouts, for the tests of the agents."""
 
+import ast
+import inspect
+import itertools
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +13,7 @@ from typing import Any
 import torch
 
 from endless_gym.specs import spec
+from endless_gym_agents import settings as all_settings
 from endless_gym_agents.agent.agent import Agent, AgentMemory, make_agent
 from endless_gym_agents.environments.groups import Environments
 from endless_gym_agents.memories.memory import MemoryState
@@ -180,3 +184,23 @@ def loss_of(agent: Agent, segment: Segment, state: MemoryState, ppo: PPO, entrop
     returns = (advantages + segment.value).flatten()
     flat = segment.flat()
     return minibatch_loss(agent, flat, minibatch, advantages.flatten(), returns, ppo, entropy_coefficient)[0]
+
+
+def documented_settings() -> dict[str, str]:
+    """The docstring below each setting by the setting's name, such as `ppo.steps`; empty if there is none."""
+    classes = {
+        one.name: one for one in ast.parse(inspect.getsource(all_settings)).body if isinstance(one, ast.ClassDef)
+    }
+
+    def texts(owner: str, prefix: str) -> Iterator[tuple[str, str]]:
+        body = classes[owner].body
+        for field, after in itertools.zip_longest(body, body[1:]):
+            if isinstance(field, ast.AnnAssign):
+                name, kind = prefix + ast.unparse(field.target), ast.unparse(field.annotation)
+                if kind in classes:
+                    yield from texts(kind, name + ".")
+                else:
+                    is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                    yield name, " ".join(str(after.value.value).split()) if is_text else ""
+
+    return dict(texts("Settings", ""))

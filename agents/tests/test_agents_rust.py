@@ -15,6 +15,7 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 import torch
+from agents_helpers import documented_settings
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional
@@ -342,6 +343,20 @@ def test_defaults_and_presets_are_those_of_the_python_agents(preset: str) -> Non
             assert found is not None, name
             given = found[1] if isinstance(expected, str) else json.loads(found[1])
             assert given == expected, name
+
+
+def test_help_texts_are_those_of_the_python_agents() -> None:
+    # Another meaning, or other choices.
+    others = ("agent", "threads", "init_from", "environment.option", "environment.observation", "environment.wrapper")
+    expected = documented_settings()
+    for name, text in described().items():
+        if name not in others:
+            # The name of the value, the text, and the default or the possible values.
+            said = re.split(r"\s*\[default|\s*\[possible|\s*Possible", re.sub(r"^ *(<[^>]*>|\[=<[^>]*>\])?", "", text))[
+                0
+            ]
+            said = " ".join(said.split())
+            assert expected[name].startswith(said[0].lower() + said[1:].rstrip(".")), name
 
 
 def test_ranges_are_those_of_the_python_agents() -> None:

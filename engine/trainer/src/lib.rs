@@ -5,12 +5,12 @@
 //! | module | contents |
 //! | --- | --- |
 //! | [`settings`] | the settings, with their defaults and checks |
-//! | [`run_folder`] | the folder of a run and its lock |
+//! | `run_folder` | the folder of a run and its lock |
 //! | [`environments`] | groups of environments, in this process or served by an engine |
 //! | [`network`] | the network, forward and backward |
-//! | [`rollout`] | playing: segments of steps |
-//! | [`update`] | learning from a segment, by the [`minibatches`] of sequences |
-//! | [`checkpoint`], [`logs`], [`metrics`] | what a run writes |
+//! | `rollout` | playing: segments of steps |
+//! | `update` | learning from a segment, by the `minibatches` of sequences |
+//! | [`checkpoint`], `logs`, `metrics` | what a run writes |
 //!
 //! What the Python agents define has the same names here, and the same numbers up to rounding: settings, columns of `progress.jsonl`,
 //! weights. Each reads the other's weights.
@@ -21,16 +21,16 @@
 pub mod checkpoint;
 pub mod environments;
 pub mod error;
-pub mod logs;
-pub mod metrics;
-pub mod minibatches;
+mod logs;
+mod metrics;
+mod minibatches;
 pub mod network;
-pub mod rollout;
-pub mod run_folder;
+mod rollout;
+mod run_folder;
 mod served;
 pub mod settings;
-pub mod threads;
-pub mod update;
+mod threads;
+mod update;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -112,6 +112,7 @@ pub fn learn(
     let place = format!("{parameters} parameters, {threads_count} threads, in {}", run.display());
     print(format_args!("{env}: {place}; Ctrl-C stops the run"));
 
+    let (mut longest, mut saving) = (Duration::ZERO, Duration::ZERO);
     let mut reason = None;
     let mut is_done = update >= settings.ppo.updates;
     while !is_done {
@@ -153,15 +154,19 @@ pub fn learn(
                 None => None,
             };
         }
+        longest = longest.max(begin.elapsed());
         let minutes = |minutes: f64| Duration::try_from_secs_f64(60.0 * minutes).unwrap_or(Duration::MAX);
-        let is_late = |limit: f64, since: Instant| limit > 0.0 && since.elapsed() >= minutes(limit);
-        let is_stopped = stop.load(Ordering::Relaxed) || reason.is_some() || is_late(settings.time_limit, started);
+        let is_late = |limit: f64, time: Duration| limit > 0.0 && time >= minutes(limit);
+        // Time for a checkpoint now, another update, and the last checkpoint.
+        let is_over = is_late(settings.time_limit, started.elapsed() + longest + 2 * saving);
+        let is_stopped = stop.load(Ordering::Relaxed) || reason.is_some() || is_over;
         is_done = is_stopped || update >= settings.ppo.updates;
         let is_planned = is_done || update % settings.checkpoint_interval == 0;
-        if is_planned || is_late(settings.checkpoint_minutes, saved_at) {
+        if is_planned || is_late(settings.checkpoint_minutes, saved_at.elapsed()) {
+            let begin = Instant::now();
             logger.sync()?;
             save((update, steps), &network, &learner, &state, settings.keep_checkpoints && is_planned)?;
-            (saved, saved_at) = (update, Instant::now());
+            (saved, saved_at, saving) = (update, Instant::now(), begin.elapsed());
         }
     }
     if let Some(reason) = reason {

@@ -67,7 +67,7 @@ pub struct Settings {
     /// Environment steps of the run, rounded up to a whole update; 0 for `--ppo.updates`, which it replaces.
     #[arg(long, default_value_t = 0)]
     pub total_steps: u64,
-    /// Updates between two checkpoints; the last update always writes one.
+    /// Updates between two checkpoints; the last update always writes a checkpoint.
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..))]
     pub checkpoint_interval: u64,
     /// Largest number of minutes between two checkpoints; 0 for no limit.
@@ -76,7 +76,7 @@ pub struct Settings {
     /// Keep all checkpoints, for evaluation, instead of only the last.
     #[arg(long, default_value_t = false, action = ArgAction::Set, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub keep_checkpoints: bool,
-    /// Minutes after which training stops with a checkpoint; 0 for no limit.
+    /// Minutes within which training stops with a checkpoint, by the time that updates and checkpoints took; 0 for no limit.
     #[arg(long, default_value_t = 0.0, value_parser = number(FROM_ZERO))]
     pub time_limit: f64,
     /// Stop when the mean reward of the last 100 episodes reaches this value [default: none].
@@ -158,13 +158,13 @@ pub struct Environment {
     /// where observations are integers].
     #[arg(long = "environment.wrapper", value_name = "CLASS", value_parser = [VECTORS, ONE_HOT])]
     pub wrapper: Vec<String>,
-    /// Number of environments in all groups.
+    /// Total number of environments in all groups.
     #[arg(long = "environment.num-envs", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
     pub num_envs: usize,
-    /// Groups of environments. With two, an engine process steps one while the agent computes the actions for the other.
+    /// Groups of environments. With two, an engine process steps one group while the agent computes the actions for the other.
     #[arg(long = "environment.groups", default_value_t = 1, value_parser = integer(1..=MAX_COUNT))]
     pub groups: usize,
-    /// Where the environments step.
+    /// `thread`: environments in this process. `process`: in an engine process, over shared memory.
     #[arg(long = "environment.engine", value_enum, default_value_t = Place::Thread)]
     pub engine: Place,
     /// Threads that step the environments; 0 for one per core.
@@ -187,7 +187,7 @@ pub struct Recurrence {
     /// Fully connected layer before the recurrent layers.
     #[arg(long = "recurrence.embedding", default_value_t = true, action = ArgAction::Set, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     pub embedding: bool,
-    /// Length of truncated BPTT in steps; a longer segment is a multiple of it, and its sequences start from stored hidden states.
+    /// Length of truncated BPTT in steps; longer segments are cut into sequences that start from stored states.
     #[arg(long = "recurrence.sequence-length", default_value_t = 64, value_parser = integer(1..=MAX_COUNT))]
     pub sequence_length: usize,
 }
