@@ -118,7 +118,7 @@ def report() -> None:
         "reset parameters. Some runs learn with other reset parameters first: fewer commands in Mortar Mayhem, a reward for new",
         "tiles of the path in Mystery Path. The paper's agents, means of five runs after their whole training, learnt from",
         "frames, which is harder: the table shows what an hour buys, not which agent is better. Two runs at a time shared two",
-        "cores of a cloud machine, at times with tests; minutes are means over the seeds. Rows of one seed are of earlier",
+        "cores of an AMD EPYC, at times with tests; minutes are means over the seeds. Rows of one seed are of earlier",
         "versions, which cut the GRU's sequences where episodes start; their `mingru` runs in Mystery Path had kernels 1.7 times",
         "as fast as the others. The JSON files in this folder have the commands of all runs; to repeat those of three seeds, run",
         "`python agents/benches/hour.py TASK AGENT --seeds 1 2 3`.",

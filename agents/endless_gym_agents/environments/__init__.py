@@ -1,1 +1,1 @@
-"""The environments that agents play: vectors of them, wrappers, replacement of a lost engine, and ranks of data-parallel training."""
+"""The environments that agents play: vectors of them, wrappers, replacement of a lost engine, ranks."""

@@ -29,12 +29,12 @@ from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common import atomic, command
 from endless_gym_agents.common.ranges import Positive
 from endless_gym_agents.environments import wrappers
-from endless_gym_agents.evaluation.evaluate import evaluate, mean
+from endless_gym_agents.evaluation.evaluate import EVALUATION_SEEDS, evaluate, mean
 from endless_gym_agents.settings import Settings, to_dict
 from endless_gym_agents.training.checkpoint import Checkpoint, load, protected, to_safetensors
 
 #: Seed of the episodes and of the sampled actions of recorded vectors.
-VECTORS_SEED = 200_000
+VECTORS_SEED = EVALUATION_SEEDS.start
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from endless_gym.create import make_vec
 from endless_gym.experts import Experts
 from endless_gym.specs import spec
 from endless_gym_agents.common import command
+from endless_gym_agents.evaluation.evaluate import EVALUATION_SEEDS
 from endless_gym_agents.settings import STATES, VECTORS, Environment, Settings
 
 #: What a task measures: which of several things was seen; where something is; in which order things were seen; how many; whether
@@ -31,7 +32,7 @@ Label = Literal["object", "spatial", "sequential", "capacity", "rewriting"]
 #: Share of the way from random actions to the expert that an agent without memory must not reach.
 GATE = 0.5
 #: Seeds of the episodes of experts and random actions; the evaluation's first ones.
-SEEDS = range(200_000, 200_400)
+SEEDS = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + 400)
 
 
 @dataclass(frozen=True)

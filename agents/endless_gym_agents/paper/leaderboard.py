@@ -32,7 +32,7 @@ from endless_gym_agents.agent.agent import Agent
 from endless_gym_agents.common import atomic, command
 from endless_gym_agents.common.ranges import Natural, Range
 from endless_gym_agents.evaluation import compare, export, protocol
-from endless_gym_agents.evaluation.evaluate import evaluate, mean
+from endless_gym_agents.evaluation.evaluate import EVALUATION_SEEDS, evaluate, mean
 from endless_gym_agents.evaluation.ruler import Task
 from endless_gym_agents.paper import jobs_ray, reproduce
 from endless_gym_agents.paper.experiments import definitions, planning
@@ -186,7 +186,8 @@ def longer(agent: Agent, task: Task, seeds: int) -> float:
     env, options = task.longer
     environment: Environment = dataclasses.replace(agent.settings.environment, option=options)
     settings = dataclasses.replace(agent.settings, env=env, environment=environment)
-    return mean(evaluate(agent, range(200_000, 200_000 + seeds), 1, num_threads=1, settings=settings))
+    chosen = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + seeds)
+    return mean(evaluate(agent, chosen, 1, num_threads=1, settings=settings))
 
 
 def export_best(done: dict[str, list[tuple[float, Job]]], folder: Path) -> None:

@@ -61,7 +61,7 @@ struct EngineArgs {
     pin_threads: bool,
     /// Groups of environments. They are stepped independently, so that the trainer can process one while the engine
     /// steps another.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = EngineConfig::GROUPS)]
     groups: usize,
     /// Name of the engine, by which trainers find it: 1 to 64 letters, digits, `.`, `_` or `-`.
     #[arg(long, value_name = "NAME", default_value = "endless", alias = "name")]
@@ -79,7 +79,7 @@ struct EngineArgs {
     #[arg(long)]
     state: bool,
     /// Batches of each group that the trainer may hold at a time, 1 to 16.
-    #[arg(long, default_value_t = 3)]
+    #[arg(long, default_value_t = EngineConfig::BATCHES_HELD)]
     batches_held: usize,
     /// Save all environments to FILE when the engine stops and when its trainer requests it.
     #[arg(long, value_name = "FILE")]

@@ -73,11 +73,11 @@ fn default_service() -> String {
 }
 
 fn default_groups() -> usize {
-    1
+    EngineConfig::GROUPS
 }
 
 fn default_batches_held() -> usize {
-    3
+    EngineConfig::BATCHES_HELD
 }
 
 fn default_observers() -> usize {
@@ -85,6 +85,11 @@ fn default_observers() -> usize {
 }
 
 impl EngineConfig {
+    /// Default of [`groups`](Self::groups).
+    pub const GROUPS: usize = 1;
+    /// Default of [`batches_held`](Self::batches_held).
+    pub const BATCHES_HELD: usize = 3;
+
     /// One group in the default namespace, with `batches_held` and `observers` of 3, without a checkpoint.
     pub fn new(service: &str, pool: PoolConfig, threads: usize) -> Self {
         EngineConfig {
