@@ -351,11 +351,9 @@ def test_help_texts_are_those_of_the_python_agents() -> None:
     expected = documented_settings()
     for name, text in described().items():
         if name not in others:
-            # The name of the value, the text, and the default or the possible values.
-            said = re.split(r"\s*\[default|\s*\[possible|\s*Possible", re.sub(r"^ *(<[^>]*>|\[=<[^>]*>\])?", "", text))[
-                0
-            ]
-            said = " ".join(said.split())
+            # After the name of the value, and before the default or the possible values.
+            text = re.sub(r"^ *(<[^>]*>|\[=<[^>]*>\])?", "", text)
+            said = " ".join(re.split(r"\[default|\[possible|Possible", text)[0].split())
             assert expected[name].startswith(said[0].lower() + said[1:].rstrip(".")), name
 
 
