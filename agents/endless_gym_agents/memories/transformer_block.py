@@ -273,7 +273,7 @@ class Block(nn.Module):
 
 
 class ActingBlock:
-    """A block for one step of n environments, with few operations; see `acting`.
+    """A block for one step of n environments, with few operations, as `agent.acting` has for the other layers.
 
     Weights that need no transposition or conversion are shared with the block, not copied.
     """
